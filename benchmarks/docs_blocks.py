@@ -139,9 +139,11 @@ def _environment(work: Path) -> dict[str, str]:
     )
     program.chmod(0o755)
     return os.environ | {
-        "PATH": f"{program.parent}{os.pathsep}{os.environ['PATH']}", "PYTHONPATH": str(ROOT),
-        "STREETFIX_PORT": str(_free_port()), "ORT_DISABLE_TELEMETRY": "1",
-    }  # fmt: skip
+        "PATH": f"{program.parent}{os.pathsep}{os.environ['PATH']}",
+        "PYTHONPATH": str(ROOT),
+        "STREETFIX_PORT": str(_free_port()),
+        "ORT_DISABLE_TELEMETRY": "1",
+    }
 
 
 def _free_port() -> int:
@@ -189,9 +191,16 @@ def _serves(command: str) -> bool:
 
 def _call(arguments: list[str], work: Path, environment: dict[str, str]) -> None:
     subprocess.run(
-        arguments, cwd=work, env=environment, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
-        check=True, timeout=_BLOCK_S,
-    )  # fmt: skip
+        arguments,
+        cwd=work,
+        env=environment,
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        check=True,
+        timeout=_BLOCK_S,
+    )
 
 
 @contextmanager

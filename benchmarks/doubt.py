@@ -29,8 +29,12 @@ PARTIAL = (0, 1, 2)
 ACCEPTED = (0.0, 0.001, 0.002, 0.003, 0.005, 0.01, 0.02, 0.03, 0.05, 0.1, 0.2, 0.5, 1.0)
 #: Draws one image: depth (z, metres, 0 for none) and grey level.
 Picture = Callable[[np.random.Generator], tuple[NDArray[np.float64], NDArray[np.float64]]]
-FALSE_BARS = {("other_city", "precise"): 0.003, ("removed_streets", "precise"): 0.005,
-              ("other_city", "stereo"): 0.02, ("removed_streets", "stereo"): 0.03}  # fmt: skip
+FALSE_BARS = {
+    ("other_city", "precise"): 0.003,
+    ("removed_streets", "precise"): 0.005,
+    ("other_city", "stereo"): 0.02,
+    ("removed_streets", "stereo"): 0.03,
+}
 
 
 @dataclass(frozen=True)
@@ -83,7 +87,9 @@ def doubt_rows(report: Report, runs: Runs) -> None:
         other = Strangers.of(_of_another_city(runs, preset))
         _false_rows(report, f"doubt.other_city.{preset}", other, confidence, right, FALSE_BARS["other_city", preset])
         away, near, near_right = _where_streets_are_missing(runs, preset)
-        _false_rows(report, f"doubt.removed_streets.{preset}", away, near, near_right, FALSE_BARS["removed_streets", preset])  # fmt: skip
+        _false_rows(
+            report, f"doubt.removed_streets.{preset}", away, near, near_right, FALSE_BARS["removed_streets", preset]
+        )
         strangers |= {f"other_city.{preset}": other, f"removed_streets.{preset}": away}
         take = np.random.default_rng(5).permutation(len(confidence))[: 1000 if preset == "stereo" else 500]
         inside.append((confidence[take], right[take]))

@@ -90,9 +90,11 @@ def _gallery(dataset: Dataset, drive: Path, grid: ViewGrid, rows: NDArray[np.boo
         panorama = panorama_from_points(scan.points, grid)
         for turn in fan(HEADINGS):
             view = survey_planes(
-                view_from_panorama(panorama, scan.start_rad + float(turn), grid), sensor_height_m=scan.level.height_m,
-                rows_seen=rows, grid=grid,
-            )  # fmt: skip
+                view_from_panorama(panorama, scan.start_rad + float(turn), grid),
+                sensor_height_m=scan.level.height_m,
+                rows_seen=rows,
+                grid=grid,
+            )
             if view[0].any():
                 planes += [view, _mirrored(view)]
                 place += [number, number + len(scans)]

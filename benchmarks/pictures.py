@@ -41,7 +41,7 @@ STEPS = {
     "maps/small": "build-map data/small --out maps/small",
     "runs/small": "evaluate maps/small data/small --report runs/small",
     "runs/hard": "evaluate maps/small data/hard --report runs/hard",
-}  # fmt: skip
+}
 DEMO = "demo --once --streets 3 --queries 8 --port 0 --out demo"
 
 
@@ -89,8 +89,11 @@ def draw_street(dataset: Dataset, path: Path, *, width: int = 330) -> None:
     rgb, depth_m = frame.rgb(), frame.depth_m()
     fused = cv2.cvtColor(picture_of(fuse(rgb, depth_m).planes, ViewGrid().max_range_m), cv2.COLOR_RGB2BGR)
     size = (width, round(rgb.shape[0] * width / rgb.shape[1]))
-    parts = [cv2.resize(cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR), size, interpolation=cv2.INTER_AREA), depth_bgr(depth_m, width=width),
-             cv2.resize(fused, size, interpolation=cv2.INTER_AREA)]  # fmt: skip
+    parts = [
+        cv2.resize(cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR), size, interpolation=cv2.INTER_AREA),
+        depth_bgr(depth_m, width=width),
+        cv2.resize(fused, size, interpolation=cv2.INTER_AREA),
+    ]
     gap = np.full((size[1], 6, 3), 255, np.uint8)
     _write(path, np.concatenate([parts[0], gap, parts[1], gap, parts[2]], axis=1))
 
@@ -146,8 +149,17 @@ def draw_terminal(command: str, printed: str, path: Path) -> None:
     lines = [f"$ {command}", *(line.rstrip().replace("\t", " ") for line in printed.strip("\n").splitlines())]
     columns = max(len(line) for line in lines)
     figure = plt.figure(figsize=(columns * 0.077 + 0.4, len(lines) * 0.1435 + 0.4), dpi=110, facecolor="#15191d")
-    figure.text(0.2 / figure.get_figwidth(), 1 - 0.2 / figure.get_figheight(), "\n".join(lines), family="DejaVu Sans Mono", fontsize=9.2,
-                color="#e3e6e8", va="top", linespacing=1.12, parse_math=False)  # fmt: skip
+    figure.text(
+        0.2 / figure.get_figwidth(),
+        1 - 0.2 / figure.get_figheight(),
+        "\n".join(lines),
+        family="DejaVu Sans Mono",
+        fontsize=9.2,
+        color="#e3e6e8",
+        va="top",
+        linespacing=1.12,
+        parse_math=False,
+    )
     figure.savefig(path, facecolor=figure.get_facecolor())
     plt.close(figure)
 

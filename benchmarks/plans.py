@@ -77,9 +77,12 @@ def height_plan(height_m: float) -> SimulationPlan:
         QueryPlan(name="pitched", traversal=61, count=HEIGHT_COUNT // 2, pitch_deg=5.0),
     )
     return SimulationPlan(
-        name=f"height-{height_m:g}", seed=EVALUATION_SEEDS[30], size_m=HEIGHT_CITY_M, camera_height_m=height_m,
+        name=f"height-{height_m:g}",
+        seed=EVALUATION_SEEDS[30],
+        size_m=HEIGHT_CITY_M,
+        camera_height_m=height_m,
         queries=queries,
-    )  # fmt: skip
+    )
 
 
 def lidar_16_plan() -> SimulationPlan:

@@ -93,18 +93,35 @@ MEASURED: dict[str, dict[str, tuple[str, ...]]] = {
     "house": {"": (*_ALL, "pyproject.toml", "README.md", "docs")},
     "kitti": {"": (*_CORE, *_DATA, "model_training/importing")},
     "paper": {"": (*_CORE, *_DATA, "research/baselines", "model_training/training")},
-    "real_data": {"": (*_CORE, *_DATA, "model_training/importing", "model_training/odometry", "model_training/exporting"),
-                  "real.matcher.": ("model_training/importing", "model_training/simulation",
-                                    "model_training/evaluation/disparity_errors.py"),
-                  "real.peers.": (*_CORE, *_DATA, "model_training/importing", "research/baselines"),
-                  "ros2.": (*_CORE, "service/bridge")},
-    "serving": {"": ("service", "native"), "fuzz.": _ALL,
-                "native.": (*_CORE, "service/compiled.py", "service/layout.h", "native"),
-                "sanitizers.": ("service/imaging", "service/registration", "service/layout.h", "native",
-                                "tests/unit/imaging", "tests/unit/registration")},
-    "training": {"": ("model_training/training", "model_training/simulation", "service/imaging", "service/geometry"),
-                 "demo.": _ALL, "test.": (*_ALL, "research", "tests")},
-}  # fmt: skip
+    "real_data": {
+        "": (*_CORE, *_DATA, "model_training/importing", "model_training/odometry", "model_training/exporting"),
+        "real.matcher.": (
+            "model_training/importing",
+            "model_training/simulation",
+            "model_training/evaluation/disparity_errors.py",
+        ),
+        "real.peers.": (*_CORE, *_DATA, "model_training/importing", "research/baselines"),
+        "ros2.": (*_CORE, "service/bridge"),
+    },
+    "serving": {
+        "": ("service", "native"),
+        "fuzz.": _ALL,
+        "native.": (*_CORE, "service/compiled.py", "service/layout.h", "native"),
+        "sanitizers.": (
+            "service/imaging",
+            "service/registration",
+            "service/layout.h",
+            "native",
+            "tests/unit/imaging",
+            "tests/unit/registration",
+        ),
+    },
+    "training": {
+        "": ("model_training/training", "model_training/simulation", "service/imaging", "service/geometry"),
+        "demo.": _ALL,
+        "test.": (*_ALL, "research", "tests"),
+    },
+}
 
 
 def measured_paths(report: str, row_id: str) -> tuple[str, ...]:
@@ -207,5 +224,9 @@ def this_process(command: str) -> Run:
         command: command that makes the rows.
     """
     return Run(
-        commit=loaded_commit(), dirty=is_dirty(), date=datetime.now(UTC).isoformat(timespec="seconds"), machine=machine(), command=command
-    )  # fmt: skip
+        commit=loaded_commit(),
+        dirty=is_dirty(),
+        date=datetime.now(UTC).isoformat(timespec="seconds"),
+        machine=machine(),
+        command=command,
+    )

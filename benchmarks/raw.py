@@ -79,6 +79,12 @@ def _row(report: Report, row_id: str, parts: Iterable[dict[str, tuple[int, int]]
     best = max(totals, key=lambda setting: totals[setting][0])
     right, count = totals[best]
     report.row(
-        row_id, right / count, "share", bar=bar, better="lower", n=count, ci95=list(wilson_interval(right, count)),
+        row_id,
+        right / count,
+        "share",
+        bar=bar,
+        better="lower",
+        n=count,
+        ci95=list(wilson_interval(right, count)),
         why=f"best setting: {best}",
-    )  # fmt: skip
+    )

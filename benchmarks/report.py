@@ -152,9 +152,13 @@ class Report:
         path = self.folder / f"{self.name}.json"
         last = json.loads(path.read_text()) if self._keep and path.exists() else {"runs": {}, "rows": []}
         this = Run(
-            commit=self._commit, dirty=self._dirty, date=self._date, machine=machine(), command=self.command,
+            commit=self._commit,
+            dirty=self._dirty,
+            date=self._date,
+            machine=machine(),
+            command=self.command,
             minutes=round((time.monotonic() - self._began) / 60, 2),
-        )  # fmt: skip
+        )
         runs = dict(last["runs"])
         keys = {run: add_run(runs, run) for run in dict.fromkeys(self._runs[row["id"]] or this for row in self.rows)}
         rows = {row["id"]: row for row in last["rows"]}

@@ -63,8 +63,15 @@ def own_size(report: Report, packs: list[Path], work: Path, steps: int) -> None:
     images = (last - first) * 2 * TrainingConfig().pairs / (ended - began)
     minutes = PAPER_FRAMES * PAPER_EPOCHS / images / 60
     report.row("training.images_per_s", images, "1/s", n=last - first)
-    report.row("training.minutes_for_paper_images", minutes, "min", bar=10, better="lower", n=last - first,
-               why=f"{PAPER_FRAMES} x {PAPER_EPOCHS} branches of pairs, 32 x 128; the paper: {PAPER_MINUTES} min, 224 x 224")  # fmt: skip
+    report.row(
+        "training.minutes_for_paper_images",
+        minutes,
+        "min",
+        bar=10,
+        better="lower",
+        n=last - first,
+        why=f"{PAPER_FRAMES} x {PAPER_EPOCHS} branches of pairs, 32 x 128; the paper: {PAPER_MINUTES} min, 224 x 224",
+    )
 
 
 def paper_size(report: Report, packs: list[Path], steps: int) -> None:
@@ -88,8 +95,12 @@ def paper_size(report: Report, packs: list[Path], steps: int) -> None:
         batch = city.draw(32, rng)
         count = len(batch.query_xy)
         rows = augment.cut_rows(batch.rows_seen, count)
-        planes = torch.cat([augment.query(batch.query_ranges, batch.query_rgb, batch.query_height_m, rows),
-                            augment.survey(batch.survey_ranges, batch.survey_intensity, batch.survey_height_m, rows)])  # fmt: skip
+        planes = torch.cat(
+            [
+                augment.query(batch.query_ranges, batch.query_rgb, batch.query_height_m, rows),
+                augment.survey(batch.survey_ranges, batch.survey_intensity, batch.survey_height_m, rows),
+            ]
+        )
         large = functional.interpolate(planes, size=(224, 224), mode="nearest").contiguous(
             memory_format=torch.channels_last
         )

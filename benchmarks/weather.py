@@ -25,9 +25,12 @@ def snow_plan(survey_condition: str) -> SimulationPlan:
     """
     queries = (QueryPlan(name="drive1", traversal=1, count=250, depths=("precise",)),)
     return SimulationPlan(
-        name=f"survey-in-{survey_condition}", seed=EVALUATION_SEEDS[10], size_m=(200.0, 260.0), survey_condition=survey_condition,
+        name=f"survey-in-{survey_condition}",
+        seed=EVALUATION_SEEDS[10],
+        size_m=(200.0, 260.0),
+        survey_condition=survey_condition,
         queries=queries,
-    )  # fmt: skip
+    )
 
 
 def removed_and_lost(snow: Dataset, clear: Dataset) -> tuple[float, float, int]:

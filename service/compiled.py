@@ -86,9 +86,11 @@ def _compare(
     declared = {constant: (0, value) for constant, value in constants.items()}
     for name, declaration in structures.items():
         declared |= declared_layout(name, declaration)
-    told = {entry: at for entry, at in compiled.items() if entry in declared or entry.partition(".")[0] in structures}
-    for entry in sorted(declared.keys() | told.keys()):
-        in_python, in_c = declared.get(entry), told.get(entry)
+    compiled_entries = {
+        entry: at for entry, at in compiled.items() if entry in declared or entry.partition(".")[0] in structures
+    }
+    for entry in sorted(declared.keys() | compiled_entries.keys()):
+        in_python, in_c = declared.get(entry), compiled_entries.get(entry)
         if in_python != in_c:
             raise StreetfixError(
                 f"{path.name} was not compiled from the C files of this release: {entry} is {_shown(in_c)} in C and "

@@ -120,11 +120,8 @@ def make_content(*, name: str = "tiny", seed: int = 0, **changed: Any) -> Bundle
     descriptors[TRUE_PLACE * HEADINGS + TRUE_HEADING] = true
     descriptors /= np.linalg.norm(descriptors, axis=1, keepdims=True)
     T_map_place = np.stack(
-        [
-            transform_from(rotation_z(0.0), np.array([10.0 * (n % 6), 100.0 * (n // 6), 2.0]))
-            for n in range(PLACES)
-        ]
-    )  # fmt: skip
+        [transform_from(rotation_z(0.0), np.array([10.0 * (n % 6), 100.0 * (n // 6), 2.0])) for n in range(PLACES)]
+    )
     given: dict[str, Any] = {
         "name": name,
         "grid": GRID,

@@ -52,9 +52,14 @@ def main() -> None:
     arguments.log.parent.mkdir(parents=True, exist_ok=True)
     with small_disk(int(8 * size / 2**20) + 64) as disk, arguments.log.open("w", buffering=1) as log:
         chaos = Chaos(
-            disk, site.bundle, pair_of(site), seed=arguments.seed, workers=arguments.workers,
-            tell=lambda line: print(line, flush=True), log=lambda line: print(f"{time.strftime('%H:%M:%S')} {line}", file=log),
-        )  # fmt: skip
+            disk,
+            site.bundle,
+            pair_of(site),
+            seed=arguments.seed,
+            workers=arguments.workers,
+            tell=lambda line: print(line, flush=True),
+            log=lambda line: print(f"{time.strftime('%H:%M:%S')} {line}", file=log),
+        )
         found = chaos.run(arguments.steps, stop_at_first=arguments.stop)
     print(f"{found.steps} steps in {(time.monotonic() - began) / 60:.1f} minutes, seed {found.seed}", flush=True)
     rows(report, found)
@@ -84,14 +89,19 @@ def rows(report: Report, found: Findings) -> None:
         ("chaos.wrong_or_lost_answers", found.wrong),
         ("chaos.disagreements", found.disagreements),
     ):
-        report.row(name, len(told), "count", bar=0, better="lower", n=found.answers,
-                   why=f"first: {told[0]}" if told else None)  # fmt: skip
+        report.row(
+            name, len(told), "count", bar=0, better="lower", n=found.answers, why=f"first: {told[0]}" if told else None
+        )
     report.row("chaos.refusals", sum(found.refusals.values()), "count", n=found.answers)
     report.row("chaos.tracebacks", found.tracebacks, "count")
     report.notes["chaos"] = {
-        "seed": found.seed, "disk": found.disk, "actions": dict(sorted(found.actions.items())),
-        "refusals": dict(found.refusals), "wrong": found.wrong[:20], "disagreements": found.disagreements[:20],
-    }  # fmt: skip
+        "seed": found.seed,
+        "disk": found.disk,
+        "actions": dict(sorted(found.actions.items())),
+        "refusals": dict(found.refusals),
+        "wrong": found.wrong[:20],
+        "disagreements": found.disagreements[:20],
+    }
 
 
 if __name__ == "__main__":

@@ -634,15 +634,24 @@ class Chaos:
 
     def _settings(self) -> dict[str, Any]:
         return {
-            "workers": self._workers, "threads": 1, "watch_s": 0.5, "drain_s": 0.5, "grace_s": 10, "request_timeout_s": 120,
+            "workers": self._workers,
+            "threads": 1,
+            "watch_s": 0.5,
+            "drain_s": 0.5,
+            "grace_s": 10,
+            "request_timeout_s": 120,
             "api_keys": self._keys_file,
-        }  # fmt: skip
+        }
 
     def _launch(self) -> subprocess.Popen[str]:
         return launch(
-            self._shelf.folder, port=self._caller.port, grpc_port=self._caller.grpc_port, stderr=subprocess.PIPE,
-            temporary=self._temporary, **self._settings(),
-        )  # fmt: skip
+            self._shelf.folder,
+            port=self._caller.port,
+            grpc_port=self._caller.grpc_port,
+            stderr=subprocess.PIPE,
+            temporary=self._temporary,
+            **self._settings(),
+        )
 
     def _start(self) -> None:
         """Start the service and keep its log.
@@ -651,9 +660,14 @@ class Chaos:
             RuntimeError: it ended before it was ready, or not all workers answer.
         """
         self._server = Server(
-            self._shelf.folder, core=None, port=self._caller.port, grpc_port=self._caller.grpc_port,
-            log=self._take_line, temporary=self._temporary, **self._settings(),
-        )  # fmt: skip
+            self._shelf.folder,
+            core=None,
+            port=self._caller.port,
+            grpc_port=self._caller.grpc_port,
+            log=self._take_line,
+            temporary=self._temporary,
+            **self._settings(),
+        )
         # Wait for all workers: a failure before each has answered once counts as a failed start and ends the service.
         until = time.monotonic() + SETTLED_S
         while len(_listeners(self._caller.port, self._pids())) < self._workers:

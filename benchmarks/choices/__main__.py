@@ -91,9 +91,9 @@ def neighbour_rows(report: Report, city: WatchCity, stock: Seen) -> None:
         ranked = np.argsort(-likeness, axis=1, kind="stable")
         known = true_street[queries] >= 0
         for k in KS:
-            voted = np.array([
-                _vote(place_street[places[:k]], of[places[:k]]) for places, of in zip(ranked, likeness, strict=True)
-            ])  # fmt: skip
+            voted = np.array(
+                [_vote(place_street[places[:k]], of[places[:k]]) for places, of in zip(ranked, likeness, strict=True)]
+            )
             right = (voted == true_street[queries])[known]
             report.share(f"choices.k.{k}.{queries.rpartition('_')[2]}.street_accuracy", right)
 

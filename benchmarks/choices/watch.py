@@ -110,10 +110,12 @@ class WatchCity:
         """
         turns, views = fan(self.settings.headings), {name: list[NDArray[np.float32]]() for name in encoders}
         for k, scan in enumerate(levelled_scans(self.dataset, self.kept, self.settings), 1):
-            planes = np.stack([
-                survey_planes(view, sensor_height_m=scan.level.height_m, rows_seen=self.rows_seen, grid=self.grid)
-                for view in fan_views(scan.points, scan.start_rad + turns, self.grid)
-            ])  # fmt: skip
+            planes = np.stack(
+                [
+                    survey_planes(view, sensor_height_m=scan.level.height_m, rows_seen=self.rows_seen, grid=self.grid)
+                    for view in fan_views(scan.points, scan.start_rad + turns, self.grid)
+                ]
+            )
             for name, (encoder, _) in encoders.items():
                 views[name].append(encoder.encode(planes, "survey"))
             report("places", k, len(self.kept))
@@ -121,9 +123,13 @@ class WatchCity:
         for each in self.sets:
             for k, frame in enumerate(self.dataset.queries(each), 1):
                 asked = query_views(
-                    frame.rgb(), frame.depth_m(), frame.camera.pinhole(), grid=self.grid, rows_seen=self.rows_seen,
+                    frame.rgb(),
+                    frame.depth_m(),
+                    frame.camera.pinhole(),
+                    grid=self.grid,
+                    rows_seen=self.rows_seen,
                     turns=turns_on(self.grid),
-                )  # fmt: skip
+                )
                 for name, (encoder, blind) in encoders.items():
                     planes = asked.planes.copy()
                     planes[:, [PLANES.index(plane) for plane in blind]] = 0.0

@@ -102,8 +102,10 @@ def serious(page: "Page") -> list[str]:
     found = page.evaluate("axe.run(document, {resultTypes: ['violations']})")
     return [
         f"{each['id']}: {node['target']} {node['failureSummary']}"
-        for each in found["violations"] if each["impact"] in ("serious", "critical") for node in each["nodes"]
-    ]  # fmt: skip
+        for each in found["violations"]
+        if each["impact"] in ("serious", "critical")
+        for node in each["nodes"]
+    ]
 
 
 def bundle_kb(static: Path) -> float:

@@ -17,13 +17,18 @@ _REFLECTION = reflection_pb2.DESCRIPTOR.services_by_name["ServerReflection"].ful
 #: Every call of the server. The first byte of an input chooses one.
 METHODS = (
     *(f"/{SERVICE}/{name}" for name in pb.DESCRIPTOR.services_by_name["LocalizationService"].methods_by_name),
-    f"/{HEALTH}/Check", f"/{HEALTH}/Watch", f"/{_REFLECTION}/ServerReflectionInfo",
-)  # fmt: skip
+    f"/{HEALTH}/Check",
+    f"/{HEALTH}/Watch",
+    f"/{_REFLECTION}/ServerReflectionInfo",
+)
 #: Allowed status codes.
 _ANSWERS = {
-    grpc.StatusCode.OK, grpc.StatusCode.INVALID_ARGUMENT, grpc.StatusCode.NOT_FOUND, grpc.StatusCode.OUT_OF_RANGE,
+    grpc.StatusCode.OK,
+    grpc.StatusCode.INVALID_ARGUMENT,
+    grpc.StatusCode.NOT_FOUND,
+    grpc.StatusCode.OUT_OF_RANGE,
     grpc.StatusCode.UNIMPLEMENTED,
-}  # fmt: skip
+}
 _DEADLINE_S = 60.0
 
 
@@ -72,16 +77,19 @@ def _ended(call: Iterable[bytes]) -> grpc.StatusCode:
 
 def _seeds() -> Iterator[bytes]:
     frame: dict[str, Any] = {
-        "rgb": b"1", "depth": b"2", "camera": pb.Camera(width=64, height=48, fx=32, fy=32, cx=31.5, cy=23.5, height_m=0.3),
+        "rgb": b"1",
+        "depth": b"2",
+        "camera": pb.Camera(width=64, height=48, fx=32, fy=32, cx=31.5, cy=23.5, height_m=0.3),
         "depth_format": pb.DepthFormat(scale_m=0.001, kind=pb.DEPTH_KIND_DISPARITY, baseline_m=0.1, max_range_m=40.0),
         "gravity": pb.Vector3(y=9.8),
-    }  # fmt: skip
+    }
     about: dict[str, Any] = {
-        "map": "tiny", "options": pb.Options(refine=True, neighbours=5), "vehicle_from_camera": pb.RigidTransform(
-            position=pb.Vector3(z=1), orientation=pb.Quaternion(w=1)
-        ), "vehicle_base_on_ground": True,
+        "map": "tiny",
+        "options": pb.Options(refine=True, neighbours=5),
+        "vehicle_from_camera": pb.RigidTransform(position=pb.Vector3(z=1), orientation=pb.Quaternion(w=1)),
+        "vehicle_base_on_ground": True,
         "prior": pb.Prior(position=pb.PriorPosition(x=1, y=2, std_m=3), heading_deg=10),
-    }  # fmt: skip
+    }
     request = pb.LocalizeRequest(**frame, **about)
     behind = pb.RigidTransform(position=pb.Vector3(z=-1), orientation=pb.Quaternion(w=1))
     second = pb.SequenceFrame(**frame, reference_from_camera=behind)

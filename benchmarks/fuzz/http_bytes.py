@@ -21,7 +21,7 @@ SEEDS = (
     b"\x00" + 2 * PIPELINED * b"GET / HTTP/1.1\r\n\r\n",
     b"\xffGET / HTTP/1.1\r\n" + HEAD_BYTES // 64 * (b"X-A: " + 90 * b"a" + b"\r\n"),
     b"\x20GET / HTTP/1.0\r\nConnection: upgrade\r\nUpgrade: websocket\r\n\r\n",
-)  # fmt: skip
+)
 #: Turns of the event loop, far more than an application needs that waits for nothing.
 _SETTLED = 40
 

@@ -74,10 +74,14 @@ def targets(bundle: Path, scratch: Path) -> dict[str, Target]:
     T = {"position": {"x": 0, "y": 0, "z": -1}, "orientation": {"x": 0, "y": 0, "z": 0, "w": 1}}
     vehicle = {"T_vehicle_camera": T | {"position": {"x": 0, "y": 0, "z": 1.5}}, "vehicle_base_on_ground": True}
     sequence = json.dumps(vehicle | {"frames": [frame, frame | {"T_reference_camera": T}]}).encode()
-    multipart = b"--b\r\n" + b"\r\n--b\r\n".join(
-        f'Content-Disposition: form-data; name="{name}"; filename="x"\r\n\r\n'.encode() + data
-        for name, data in (("rgb", b"123"), ("depth", b"456"), ("request", b"{}"))
-    ) + b"\r\n--b--\r\n"  # fmt: skip
+    multipart = (
+        b"--b\r\n"
+        + b"\r\n--b\r\n".join(
+            f'Content-Disposition: form-data; name="{name}"; filename="x"\r\n\r\n'.encode() + data
+            for name, data in (("rgb", b"123"), ("depth", b"456"), ("request", b"{}"))
+        )
+        + b"\r\n--b--\r\n"
+    )
     return {
         "http": Target(Connections().take, SEEDS, 0.10),
         "multipart": Target(_multipart, (multipart,), 0.20),
@@ -136,9 +140,15 @@ def _depth(data: bytes) -> None:
     kind: DepthKind = ("z", "range", "disparity")[how % 3]
     encoding: DepthEncoding = "carla" if how & 8 else "compressed_depth" if how & 64 else "auto"
     decode_depth(
-        data, camera=CAMERA, encoding=encoding, scale_m=0.001 if how & 16 else None, kind=kind, baseline_m=0.1,
-        max_range_m=40.0 if how & 32 else None, limits=LIMITS,
-    )  # fmt: skip
+        data,
+        camera=CAMERA,
+        encoding=encoding,
+        scale_m=0.001 if how & 16 else None,
+        kind=kind,
+        baseline_m=0.1,
+        max_range_m=40.0 if how & 32 else None,
+        limits=LIMITS,
+    )
 
 
 def _depth_seeds(depth: np.ndarray) -> list[bytes]:
@@ -151,11 +161,15 @@ def _depth_seeds(depth: np.ndarray) -> list[bytes]:
     )
     colour = np.dstack([depth & 255, depth >> 8, 0 * depth]).astype(np.uint8)
     good = [
-        (b"\x00", _encoded(".png", depth)), (b"\x30", _encoded(".tiff", metres)), (b"\x01", npy + metres.tobytes()),
-        (b"\x02", write_raw16(depth)), (b"\x02", write_raw16(depth, "lz4")),
-        (b"\x08", _encoded(".png", colour)), (b"\x40", bytes(12) + _encoded(".png", depth)),
+        (b"\x00", _encoded(".png", depth)),
+        (b"\x30", _encoded(".tiff", metres)),
+        (b"\x01", npy + metres.tobytes()),
+        (b"\x02", write_raw16(depth)),
+        (b"\x02", write_raw16(depth, "lz4")),
+        (b"\x08", _encoded(".png", colour)),
+        (b"\x40", bytes(12) + _encoded(".png", depth)),
         (b"\x40", bytes(12) + struct.pack("<ii", 64, 48) + b"\x00\x00\x86\x88"),
-    ]  # fmt: skip
+    ]
     return [how + data for how, data in good]
 
 
@@ -247,7 +261,7 @@ def _pictures_of(bundle: Path) -> Callable[[bytes], None]:
         document = {
             "camera": {"width": 64, "height": 48, "fx": fx, "fy": fy, "cx": cx, "cy": cy} | height,
             "gravity": {"x": aside, "y": down, "z": 0.0},
-        }  # fmt: skip
+        }
         try:
             request = schema.LocalizeRequest.model_validate(document)
         except ValidationError:
@@ -259,9 +273,13 @@ def _pictures_of(bundle: Path) -> Callable[[bytes], None]:
         )
         localizer.localize(
             Query(
-                rgb=good.rgb, depth_m=depth_m, camera=asked.camera, down_camera=asked.down_camera, camera_height=asked.camera_height
+                rgb=good.rgb,
+                depth_m=depth_m,
+                camera=asked.camera,
+                down_camera=asked.down_camera,
+                camera_height=asked.camera_height,
             )
-        )  # fmt: skip
+        )
 
     return take
 

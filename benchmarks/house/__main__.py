@@ -26,12 +26,16 @@ MOST_LINES, LONGEST_LINE, EASE = 120, 200, 55.0
 def main() -> None:
     """Measure the chosen parts; rows of the others stay."""
     parts: dict[str, Callable[[Report], None]] = {
-        "documents": _document_rows, "docstrings": _docstring_rows, "request": _request_rows, "blocks": _block_rows
-    }  # fmt: skip
+        "documents": _document_rows,
+        "docstrings": _docstring_rows,
+        "request": _request_rows,
+        "blocks": _block_rows,
+    }
     parser = argparse.ArgumentParser(
-        prog="python -m benchmarks.house", description="Measure how readable code and documents are, and write reports/house.json",
+        prog="python -m benchmarks.house",
+        description="Measure how readable code and documents are, and write reports/house.json",
         epilog="Example: python -m benchmarks.house --only documents docstrings",
-    )  # fmt: skip
+    )
     parser.add_argument(
         "--only", nargs="+", choices=list(parts), default=list(parts), help="parts to measure (default: all)"
     )

@@ -16,6 +16,16 @@ _ARRAY = re.compile(r"NDArray|Float\d|Int\d|Bool\[")
 #: A shape such as "(N, 3)" or "(rows, columns)". With jaxtyping, the annotation gives the shape.
 _SHAPE = re.compile(r"\([A-Za-z0-9_ ]+,[A-Za-z0-9_, ]*\)")
 _JAXTYPING = re.compile(r"(?:Float|Int|UInt|Bool|Shaped|Num)\d*\[")
+_FLOATS = re.compile(r"\bfloat\b|Float\d|NDArray")
+#: How the text of an argument may write the unit that ends the argument's name.
+_UNITS = {
+    "m": re.compile(r"\bm\b|\bmet(?:re|er)s?\b"),
+    "rad": re.compile(r"\brad\b|\bradians?\b"),
+    "deg": re.compile(r"\bdegrees?\b"),
+    "px": re.compile(r"\bpx\b|\bpixels?\b"),
+    "s": re.compile(r"\bs\b|\bseconds?\b"),
+    "ms": re.compile(r"\bms\b|\bmilliseconds?\b"),
+}
 
 
 @dataclass(frozen=True, slots=True)
@@ -24,7 +34,7 @@ class Lacking:
 
     Attributes:
         name: ``path:line name``.
-        what: "docstring", "Args", "Raises" or "shape".
+        what: "docstring", "Args: NAME", "Raises", "shape" or "unit: NAME".
     """
 
     name: str
@@ -52,7 +62,9 @@ def public_functions(package: str) -> Iterator[tuple[Path, ast.FunctionDef | ast
 
 
 def lacking(function: ast.FunctionDef | ast.AsyncFunctionDef, *, is_method: bool) -> str | None:
-    """Return the first part that a docstring lacks: itself, an argument, an error or a shape; None if complete.
+    """Return the first part that a docstring lacks: itself, an argument, an error, a shape or a unit; None if complete.
+
+    The text of a float or array argument must give the unit that ends its name, such as ``_m`` or ``_rad``.
 
     Args:
         function: a public function.
@@ -75,7 +87,28 @@ def lacking(function: ast.FunctionDef | ast.AsyncFunctionDef, *, is_method: bool
         needs_shape = _ARRAY.search(annotation) and not _JAXTYPING.search(annotation)
         if needs_shape and not _SHAPE.search(text):
             return "shape"
+    texts = _argument_texts(text)
+    for argument in given:
+        unit = _UNITS.get(argument.arg.rpartition("_")[2]) if "_" in argument.arg else None
+        is_float = argument.annotation is not None and _FLOATS.search(ast.unparse(argument.annotation))
+        if unit is not None and is_float and not unit.search(texts.get(argument.arg, "")):
+            return f"unit: {argument.arg}"
     return None
+
+
+def _argument_texts(docstring: str) -> dict[str, str]:
+    """Return the text of each argument of a docstring, without its name and line breaks."""
+    _, _, section = docstring.partition("Args:\n")
+    section = re.split(r"^\S", section, maxsplit=1, flags=re.MULTILINE)[0]
+    texts: dict[str, str] = {}
+    names: list[str] = []
+    for line in section.splitlines():
+        if match := re.match(r" {4}(\*{0,2}\w+(?:, \w+)*): (.*)", line):
+            names = [name.lstrip("*") for name in match[1].split(", ")]
+            texts |= dict.fromkeys(names, match[2])
+        else:
+            texts |= {name: f"{texts[name]} {line.strip()}" for name in names}
+    return texts
 
 
 def all_lacking() -> tuple[list[Lacking], int]:

@@ -35,9 +35,13 @@ def place_similarities(bundle: MapBundle, dataset: Dataset, query_set: str) -> F
         best = np.full(count, -1.0, np.float32)
         try:
             views = query_views(
-                frame.rgb(), frame.depth_m(), frame.camera.pinhole(), grid=bundle.grid, rows_seen=bundle.rows_seen,
+                frame.rgb(),
+                frame.depth_m(),
+                frame.camera.pinhole(),
+                grid=bundle.grid,
+                rows_seen=bundle.rows_seen,
                 turns=turns_on(bundle.grid),
-            )  # fmt: skip
+            )
             np.maximum.at(best, place, (vectors @ encoder.encode(views.planes, "query").T).max(axis=1))
         except NoDepthError:
             pass  # nothing to compare: the query finds no place

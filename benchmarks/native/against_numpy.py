@@ -121,24 +121,25 @@ def _of_registration(localizer: Localizer, cloud: SurfelMap, query: Query) -> di
     align(*solver, after, step)
     H, _ = plain.information(*solver, states, step)
     np.testing.assert_allclose(after["information"], H, rtol=1e-6, atol=1e-9 * np.abs(H).max())
-    picture, sights = measured[0].picture, SurfelRaycaster(cloud, settings.rays)
+    picture, raycaster = measured[0].picture, SurfelRaycaster(cloud, settings.rays)
     pose = rays._State(starts[0].R_map_level, starts[0].camera_m - cloud.origin_m, 0.0, 0.0)
     T, camera = pose.camera_of(picture), picture.camera
-    met, near = sights.meet(T, camera), sights._gathered[0]
-    _require_same((met,), (plain.meet(near.surfels, near.numbers, T, camera, settings.rays),))
-    adjusted = rays._pull(cloud, [picture], [met], pose, settings.rays)
-    expected = plain.pull(cloud.surfels, picture, met, T, settings.rays)
+    hits, near = raycaster.intersect(T, camera), raycaster._collections[0]
+    _require_same((hits,), (plain.intersect(near.surfels, near.numbers, T, camera, settings.rays),))
+    adjusted = rays._normal_equations(cloud, [picture], [hits], pose, settings.rays)
+    expected = plain.normal_equations(cloud.surfels, picture, hits, T, settings.rays)
     np.testing.assert_allclose(adjusted.H, expected, rtol=1e-6, atol=1e-9 * np.abs(expected).max())
     return {
         "kernel.py: one step of all starts": _both(
             lambda: align(*solver, states.copy(), step), lambda: plain.information(*solver, states, step)
         ),
         "rays.py: rays of one image": _both(
-            lambda: sights._look_up(T, camera), lambda: plain.meet(near.surfels, near.numbers, T, camera, settings.rays)
+            lambda: raycaster._cast(T, camera),
+            lambda: plain.intersect(near.surfels, near.numbers, T, camera, settings.rays),
         ),
         "rays.py: one step of the adjustment": _both(
-            lambda: rays._pull(cloud, [picture], [met], pose, settings.rays),
-            lambda: plain.pull(cloud.surfels, picture, met, T, settings.rays),
+            lambda: rays._normal_equations(cloud, [picture], [hits], pose, settings.rays),
+            lambda: plain.normal_equations(cloud.surfels, picture, hits, T, settings.rays),
         ),
     }
 

@@ -29,9 +29,9 @@ from service.registration.kernel import (
     BeamModel,
     QueryPoints,
     SolverOptions,
-    agree,
     align,
-    pulls,
+    consistency,
+    gradients,
     render,
 )
 from service.registration.points import PointSettings, blocks_of, inverse_depth_noise, points_of
@@ -155,8 +155,16 @@ def states_for(rng: np.random.Generator) -> NDArray[Any]:
 
 OPTIONS = SolverOptions(iterations=6, reach=1.0, robust_first=1.0, robust_last=0.1, free_offset=True)
 BEAM = BeamModel(
-    hit=0.7, new=0.1, gone=0.1, any=0.1, rough_m=0.1, span_m=40.0, certain=2.0, margin_m=0.3, nothing_m=60.0
-)  # fmt: skip
+    hit=0.7,
+    new=0.1,
+    removed=0.1,
+    outlier=0.1,
+    roughness_m=0.1,
+    span_m=40.0,
+    threshold_sigmas=2.0,
+    margin_m=0.3,
+    unmapped_m=60.0,
+)
 #: Largest size of random data for the codecs, bytes.
 LARGE = 400
 
@@ -195,7 +203,7 @@ def _align(rng: np.random.Generator, cloud: SurfelMap) -> list[NDArray[Any]]:
     found = [states[name] for name in states.dtype.names or ()]
     for state in states[:1]:
         patch = (np.arange(len(points)) // 7).astype(np.int32)
-        found.append(pulls(cloud.grid, cloud.surfels, points, states[:1], OPTIONS, patch))
+        found.append(gradients(cloud.grid, cloud.surfels, points, states[:1], OPTIONS, patch))
         del state
     return [*found, cloud.grid.block, cloud.grid.nearest]
 
@@ -218,7 +226,9 @@ def _render(rng: np.random.Generator, cloud: SurfelMap, height: int, width: int)
     z, sigma = rng.uniform(0.1, 60, count), rng.uniform(1e-3, 2, count)
     if rng.random() < 0.2:
         z[0] = rng.choice([np.nan, np.inf])
-    told = agree(drawn, pixel, z, sigma, rng.uniform(0, 0.3, count).astype(np.float32), BEAM, scale=1.01, offset=0.1)
+    told = consistency(
+        drawn, pixel, z, sigma, rng.uniform(0, 0.3, count).astype(np.float32), BEAM, scale=1.01, offset=0.1
+    )
     return [drawn, np.array(told)]
 
 
@@ -226,21 +236,21 @@ def _rays(rng: np.random.Generator, cloud: SurfelMap, height: int, width: int) -
     height, width = min(height, 96), min(width, 128)
     camera = camera_of(rng, height, width)
     settings = RaySettings(fewest=1, patch=int(rng.choice([1, 6, 16])))
-    sights = SurfelRaycaster(cloud, settings)
+    raycaster = SurfelRaycaster(cloud, settings)
     R, t = rotation_z(rng.uniform(-np.pi, np.pi)), np.r_[rng.uniform(-20, 20), rng.uniform(-5, 5), 1.5]
     T_level_camera = transform_from(R_BODY_OPTICAL, np.zeros(3))
-    met = sights.meet(transform_from(R, t) @ T_level_camera, camera)
+    hits = raycaster.intersect(transform_from(R, t) @ T_level_camera, camera)
     with np.errstate(all="ignore"):
         inverse = np.where((depth := depth_of(rng, height, width)) > 0, 1 / depth, 0).astype(np.float32)
     picture = RayPicture(
         inverse, camera, T_level_camera, 1e-3, (None, 80.0)[rng.integers(2)], rng.random((height, width)) < 0.3
     )
     found = Registered(R, cloud.origin_m + t, 1.0, 0.0, 0.9, np.eye(8), 0)
-    adjusted = adjust(sights, [picture], found, settings)
+    adjusted = adjust(raycaster, [picture], found, settings)
     if adjusted is None:
-        return [met]
+        return [hits]
     pose, scatter = adjusted
-    return [met, pose.R_map_level, pose.camera_m, np.array([pose.scale, pose.offset]), pose.information, scatter]
+    return [hits, pose.R_map_level, pose.camera_m, np.array([pose.scale, pose.offset]), pose.information, scatter]
 
 
 def _codecs(rng: np.random.Generator, height: int, width: int) -> list[NDArray[Any]]:

@@ -163,9 +163,10 @@ def information(
     use &= (off**2).sum(axis=2) <= options.reach**2
     r, along_y = (normal * off).sum(axis=2), (normal * y).sum(axis=2)
     facing = (normal * (points.ray @ R.transpose(0, 2, 1))).sum(axis=2)
-    J = np.concatenate([
-        normal, np.cross(y, normal), along_y[..., None], (-along_y * points.q * stretch / scale[:, None])[..., None]
-    ], axis=2)  # fmt: skip
+    J = np.concatenate(
+        [normal, np.cross(y, normal), along_y[..., None], (-along_y * points.q * stretch / scale[:, None])[..., None]],
+        axis=2,
+    )
     with np.errstate(divide="ignore", invalid="ignore"):
         ratio = np.where(along_y != 0, 1 - r / along_y, 1).clip(0.5, 2)
     along2, rest = (points.sigma * facing) ** 2, options.surface**2 + near["thickness_m"].astype(f64) ** 2
@@ -175,10 +176,10 @@ def information(
     return weighted @ J, -(weighted @ r[..., None])[..., 0]
 
 
-def meet(
+def intersect(
     surfels: NDArray[np.void], numbers: NDArray[np.int32], T: Transform, camera: PinholeCamera, settings: DiscSettings
 ) -> NDArray[np.int32]:
-    """Cast the rays of a small image on discs as ``SurfelRaycaster.meet`` does; return indices (H, W), -1 for none.
+    """Cast the rays of a small image on discs as ``SurfelRaycaster.intersect`` does; return indices (H, W), -1 for none.
 
     Every pair of a disc and a pixel of its window is computed at once.
 
@@ -217,31 +218,31 @@ def meet(
     pixel, z, apart2, disc = (v * camera.width + u)[hit], z[hit], apart2[hit], disc[hit]
     first = np.full(camera.width * camera.height, np.inf)
     np.minimum.at(first, pixel, z)
-    among = z <= first[pixel] + settings.behind_m
+    among = z <= first[pixel] + settings.same_surface_m
     pixel, apart2, disc = pixel[among], apart2[among], disc[among]
     order = np.lexsort((apart2, pixel))
     at, rank = np.unique(pixel[order], return_index=True)
-    met = np.full(len(first), -1, np.int32)
-    met[at] = numbers[disc[order[rank]]]
-    return met.reshape(camera.height, camera.width)
+    surfel_of = np.full(len(first), -1, np.int32)
+    surfel_of[at] = numbers[disc[order[rank]]]
+    return surfel_of.reshape(camera.height, camera.width)
 
 
-def pull(
-    surfels: NDArray[np.void], picture: RayPicture, met: NDArray[np.int32], T: Transform, settings: RaySettings
+def normal_equations(
+    surfels: NDArray[np.void], picture: RayPicture, surfel_of: NDArray[np.int32], T: Transform, settings: RaySettings
 ) -> Floats:
-    """Sum the normal equations (8, 8) of an image's inverse depths as ``streetfix_pull`` does, at scale 1 and offset 0.
+    """Sum the normal equations (8, 8) of an image's inverse depths as ``streetfix_normal_equations`` does, at scale 1 and offset 0.
 
     Args:
         surfels: of the map, (S,) of ``SURFEL``.
         picture: image of inverse depths; its camera is the centre of rotation.
-        met: index of the surfel in each pixel, -1 for none.
+        surfel_of: index of the surfel in each pixel, -1 for none.
         T: T_map_camera, surfels' frame.
         settings: of the adjustment.
     """
     camera, unit = picture.camera, 0.0 if picture.focal_baseline_px_m is None else 1 / picture.focal_baseline_px_m
     down, across = (-(-side // settings.patch) for side in (camera.height, camera.width))
-    v, u = np.nonzero((met >= 0) & (picture.inverse > 0))
-    inverse, near = picture.inverse[v, u].astype(np.float64), surfels[met[v, u]]
+    v, u = np.nonzero((surfel_of >= 0) & (picture.inverse > 0))
+    inverse, near = picture.inverse[v, u].astype(np.float64), surfels[surfel_of[v, u]]
     ray = np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones(len(u))], axis=1) @ T[:3, :3].T
     normal = near["normal"].astype(np.float64)
     along, off = (normal * ray).sum(axis=1), (normal * (near["xyz"] - T[:3, 3])).sum(axis=1)

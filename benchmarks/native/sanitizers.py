@@ -23,7 +23,7 @@ TESTS = tuple(
     f"tests/unit/{folder}/test_{name}.py"
     for folder, names in {
         "imaging": ("decode_depth", "gather", "level", "png16", "ros_depth"),
-        "registration": ("align", "nearest_grid", "points", "pulls", "rays", "render", "visibility"),
+        "registration": ("align", "gradients", "nearest_grid", "points", "rays", "render", "visibility"),
     }.items()
     for name in names
 )
@@ -80,10 +80,14 @@ def reports_of(unpacked: Path, arguments: list[str]) -> list[str]:
     with tempfile.TemporaryDirectory() as folder:
         log = f"{folder}/report"
         done = python_in(
-            unpacked, arguments, LD_PRELOAD=runtime(), PYTHONMALLOC="malloc",
+            unpacked,
+            arguments,
+            LD_PRELOAD=runtime(),
+            PYTHONMALLOC="malloc",
             # Python itself keeps memory until it ends, so leak detection is off.
-            ASAN_OPTIONS=f"detect_leaks=0:log_path={log}", UBSAN_OPTIONS=f"print_stacktrace=1:log_path={log}",
-        )  # fmt: skip
+            ASAN_OPTIONS=f"detect_leaks=0:log_path={log}",
+            UBSAN_OPTIONS=f"print_stacktrace=1:log_path={log}",
+        )
         told = "\n".join(path.read_text(errors="replace") for path in sorted(Path(folder).iterdir()))
     # UndefinedBehaviorSanitizer inside AddressSanitizer's runtime writes to the log or to stderr.
     found = list(_split(told + "\n" + done.stderr))

@@ -71,9 +71,13 @@ def python_in(unpacked: Path, arguments: list[str], **environment: str) -> "subp
     """
     places = [str(unpacked), sysconfig.get_path("purelib"), sysconfig.get_path("platlib"), str(ROOT)]
     return subprocess.run(
-        [sys.executable, "-S", "-P", *arguments], cwd=unpacked, capture_output=True, text=True, check=False,
+        [sys.executable, "-S", "-P", *arguments],
+        cwd=unpacked,
+        capture_output=True,
+        text=True,
+        check=False,
         env={**os.environ, "PYTHONPATH": os.pathsep.join(dict.fromkeys(places)), **environment},
-    )  # fmt: skip
+    )
 
 
 def has_gcc() -> bool:

@@ -26,7 +26,7 @@ REDUCED, REDUCED_MINUTES = Size(frames=640, pairs=320, test_images=24), 0.1
 
 
 def kept_results(bench: Bench) -> dict[str, MethodResult]:
-    """Load the results of all methods; each of the paper's two names gets its best variant on the pairs kept aside.
+    """Load the results of all methods; each of the paper's two names gets its best variant on the held-out pairs.
 
     Args:
         bench: data and folder of the results.

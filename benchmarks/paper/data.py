@@ -63,8 +63,11 @@ class PaperData:
     def made_minutes(self) -> dict[str, float]:
         """Return the wall time of making each part, minutes."""
         frames, dataset = self.work / f"frames-{self.size.frames}", self.dataset.folder
-        return {"LiDAR frames": made_minutes(frames), "RGB-D pairs, tests and survey": made_minutes(dataset),
-                "small images of the pairs": made_minutes(self.work / f"pairs-{self.size.pairs}")}  # fmt: skip
+        return {
+            "LiDAR frames": made_minutes(frames),
+            "RGB-D pairs, tests and survey": made_minutes(dataset),
+            "small images of the pairs": made_minutes(self.work / f"pairs-{self.size.pairs}"),
+        }
 
     @cached_property
     def frames(self) -> Frames:
@@ -105,9 +108,12 @@ class PaperData:
         test = self.tests["other_drive"]
         with bars() as report:
             return make_frames_at(
-                self.work / f"other-lidar-{len(test)}", lidar_above(np.asarray(test.T_map_camera)), np.asarray(test.street),
-                traversal=TEST_TRAVERSAL, report=report,
-            )  # fmt: skip
+                self.work / f"other-lidar-{len(test)}",
+                lidar_above(np.asarray(test.T_map_camera)),
+                np.asarray(test.street),
+                traversal=TEST_TRAVERSAL,
+                report=report,
+            )
 
 
 def test_set(split: str) -> str:

@@ -55,20 +55,20 @@ def draw_figures(
     keep("figure4", "Figure 4: the sensors", _setup())
     keep("figure5", "Figure 5: RGB and depth of one test image", _rgb_and_depth(data.dataset))
     keep("figure6", "Figures 6 and 7: one LiDAR frame, from the side and from above", _scan(data.dataset))
-    keep("pictures25d", "The 2.5D image of neighbouring frames, with PCA (top) and without", _pictures25d(data))
+    keep("pictures25d", "2.5D images of neighbouring frames, with PCA (top) and without PCA", _pictures25d(data))
     keep("figure8", "Figure 8: the city and its nine streets", _city(data.dataset))
-    keep("figure10", "Figure 10: training, what each method watches", _curves(results))
+    keep("figure10", "Figure 10: validation curve of each training", _curves(results))
     keep("figure11", "Figure 11: RGB, depth, and both fused by IHS", _fused(data.dataset))
-    keep("one_space", "One image space: the LiDAR's view (top) and the fused query on the view grid", _one_space(data))
+    keep("one_space", "LiDAR view (top) and fused query on the same view grid", _one_space(data))
     keep("table1", "Table I as bars", table_one(data))
-    keep("table2", "Table II: every image of the five classes, medians as lines", table_two(data, results))
+    keep("table2", "Table II: all images of the five classes; lines are medians", table_two(data, results))
     keep(
         "table3",
-        "Table III as bars; the paper's as it prints them, on its own drive",
+        "Table III as bars; figures of the paper as printed, for its own drive",
         table_three(results, figures, pace),
     )
     keep("errors", "Errors on both drives", _errors(data, results))
-    keep("k", "K-NN by k, the softmax as dashes", _by_k(results))
+    keep("k", "K-NN by k; dashed lines are softmax", _by_k(results))
     return drawn
 
 
@@ -208,10 +208,13 @@ def _city(dataset: Dataset) -> Figure:
 
 #: Quantity of a training curve, by the beginning of the method's name.
 WATCHED = (
-    ("cnn_knn_one_space_both", "street accuracy, pairs"), ("cnn_", "street accuracy, LiDAR"),
-    ("streetfix", "own view first of its batch"), ("googlenet", "median error (m)"), ("PointNetLK", "median error (m)"),
+    ("cnn_knn_one_space_both", "street accuracy, pairs"),
+    ("cnn_", "street accuracy, LiDAR"),
+    ("streetfix", "own view first of its batch"),
+    ("googlenet", "median error (m)"),
+    ("PointNetLK", "median error (m)"),
     ("", "recall at 1 within 5 m"),
-)  # fmt: skip
+)
 
 
 def _curves(results: Mapping[str, MethodResult]) -> Figure | None:

@@ -46,7 +46,7 @@ class MethodResult:
 
     @property
     def aside(self) -> float:
-        """Street accuracy on the pairs kept aside; it selects among variants of a method."""
+        """Street accuracy on the held-out pairs; it selects among variants of a method."""
         told = self.extra.get("aside")
         return float(self.extra["asked"]["aside"]["knn"]["5"][0]) if told is None else float(told)
 
@@ -84,9 +84,16 @@ class MethodResult:
             for name, each in told["answers"].items()
         }
         return MethodResult(
-            told["method"], answers, told["training_s"], told["images"], told["training_set"], told["ended"],
-            [CurvePoint(int(a), b, c, d) for a, b, c, d in told["curve"]], told["extra"], Run(**told["run"]),
-        )  # fmt: skip
+            told["method"],
+            answers,
+            told["training_s"],
+            told["images"],
+            told["training_set"],
+            told["ended"],
+            [CurvePoint(int(a), b, c, d) for a, b, c, d in told["curve"]],
+            told["extra"],
+            Run(**told["run"]),
+        )
 
 
 def _plain(xy: NDArray[np.float64]) -> list[list[float | None]]:

@@ -20,7 +20,7 @@ from research.baselines.answers import PlaceAnswers
 from research.baselines.dual.learn import Kind
 from research.baselines.learning import read_curve
 from research.baselines.paper.knn import KS, PAPER_K
-from research.baselines.paper.variants import PLANS, Asked, Variant, run_variant, street_accuracy
+from research.baselines.paper.variants import PLANS, Variant, VariantAnswers, run_variant, street_accuracy
 from research.baselines.regression.locate import STAGES
 from research.baselines.regression.run import run as run_regression
 from research.baselines.scan_context import locate
@@ -51,10 +51,16 @@ def paper_variant(bench: Bench, name: str) -> list[MethodResult]:
     data = bench.data
     with bars() as report:
         variant = run_variant(
-            name, data.frames, data.pairs, data.tests, data.other_lidar, data.work / "runs" / "cnn",
-            budget_s=bench.budget_s, report=report,
-        )  # fmt: skip
-    extra = {"asked": {key: told_of(asked) for key, asked in variant.asked.items()}}
+            name,
+            data.frames,
+            data.pairs,
+            data.tests,
+            data.other_lidar,
+            data.work / "runs" / "cnn",
+            budget_s=bench.budget_s,
+            report=report,
+        )
+    extra = {"asked": {key: metrics_of(each) for key, each in variant.answers_by_set.items()}}
     shown = data.size.frames + (data.size.pairs if PLANS[name].pairs_too else 0)
 
     def result(method: str, answers: Mapping[str, PlaceAnswers], extra: dict[str, Any]) -> MethodResult:
@@ -63,30 +69,36 @@ def paper_variant(bench: Bench, name: str) -> list[MethodResult]:
         )
 
     return [
-        result("cnn_knn", {split: variant.asked[split].knn[PAPER_K] for split in SPLITS}, extra),
-        result("cnn_softmax", {split: variant.asked[split].softmax for split in SPLITS}, {"aside": _aside(variant)}),
+        result("cnn_knn", {split: variant.answers_by_set[split].knn[PAPER_K] for split in SPLITS}, extra),
+        result(
+            "cnn_softmax",
+            {split: variant.answers_by_set[split].softmax for split in SPLITS},
+            {"aside": _aside(variant)},
+        ),
     ]
 
 
 def _aside(variant: Variant) -> float:
-    asked = variant.asked["aside"]
-    return street_accuracy(asked.softmax, asked)
+    answered = variant.answers_by_set["aside"]
+    return street_accuracy(answered.softmax, answered)
 
 
-def told_of(asked: Asked) -> dict[str, Any]:
+def metrics_of(answered: VariantAnswers) -> dict[str, Any]:
     """Return street accuracy and mean distance (m) of softmax, and of K-NN by k.
 
     Args:
-        asked: answers of a variant with ground truth.
+        answered: answers of a variant with ground truth.
     """
 
     def both(answers: PlaceAnswers) -> list[float]:
-        return [street_accuracy(answers, asked), float(distance_errors(answers.xy, asked.truth_xy).mean())]
+        return [street_accuracy(answers, answered), float(distance_errors(answers.xy, answered.truth_xy).mean())]
 
     return {
-        "kind": asked.kind, "n": len(asked.truth_street), "softmax": both(asked.softmax),
-        "knn": {str(k): both(asked.knn[k]) for k in KS},
-    }  # fmt: skip
+        "kind": answered.kind,
+        "n": len(answered.truth_street),
+        "softmax": both(answered.softmax),
+        "knn": {str(k): both(answered.knn[k]) for k in KS},
+    }
 
 
 def raw_range(bench: Bench) -> list[MethodResult]:
@@ -102,13 +114,13 @@ def raw_range(bench: Bench) -> list[MethodResult]:
     names = [test_set(split) for split in SPLITS]
     with bars() as report:
         chosen_on = raw_best_views(bundle, data.dataset, ["second_drive_precise"], every=12, report=report)
-        asked = {name: raw_best_views(bundle, data.dataset, [name], report=report) for name in names}
+        places = {name: raw_best_views(bundle, data.dataset, [name], report=report) for name in names}
     frames = list(data.dataset.queries("second_drive_precise"))[::12]
     truth = np.array([f.T_map_camera[:2, 3] for f in frames if f.T_map_camera is not None])
     errors = {s: float(np.linalg.norm(xy[place] - truth, axis=1).mean()) for s, place in chosen_on.items()}
     best = min(errors, key=lambda s: errors[s])
     for split, name in zip(SPLITS, names, strict=True):
-        place = asked[name][best]
+        place = places[name][best]
         seen = place >= 0
         answers[split] = PlaceAnswers(np.where(seen[:, None], xy[place], np.nan), np.where(seen, street[place], -1))
     return [MethodResult("raw_range", answers, extra={"setting": best, "training_drive_mean_m": errors})]
@@ -161,10 +173,16 @@ def regression(bench: Bench) -> list[MethodResult]:
         answers = {split: each[stage].places for split, each in found.answers.items()}
         results.append(
             MethodResult(
-                stage, answers, sum(c.processor_s for c in costs), sum(c.images for c in costs), data.size.pairs,
-                pose.ended, read_curve(pose.curve), later,
+                stage,
+                answers,
+                sum(c.processor_s for c in costs),
+                sum(c.images for c in costs),
+                data.size.pairs,
+                pose.ended,
+                read_curve(pose.curve),
+                later,
             )
-        )  # fmt: skip
+        )
     return results
 
 

@@ -107,10 +107,14 @@ def pack_of(data: PaperData, shape: EncoderShape) -> Path:
     every = ViewGrid().columns // shape.columns
     part.mkdir(parents=True, exist_ok=True)
     arrays: dict[str, NDArray[Any]] = {
-        "panoramas": frames.panoramas[..., ::every], "intensities": frames.intensities[..., ::every], "places": frames.places,
-        "rows_seen": rows_seen_by(frames.panoramas), "ranges": pairs.ranges[..., ::every], "rgb": pairs.colours[:, :, ::every],
+        "panoramas": frames.panoramas[..., ::every],
+        "intensities": frames.intensities[..., ::every],
+        "places": frames.places,
+        "rows_seen": rows_seen_by(frames.panoramas),
+        "ranges": pairs.ranges[..., ::every],
+        "rgb": pairs.colours[:, :, ::every],
         "queries": pairs.views,
-    }  # fmt: skip
+    }
     for name, array in arrays.items():
         np.save(part / f"{name}.npy", array)
     part.rename(folder)
@@ -161,9 +165,15 @@ def streetfix(data: PaperData, budget_s: float | None) -> MethodResult:
         "pairs": config.pairs,
     }
     return MethodResult(
-        method, _answers(data, encoder), curve[-1].processor_s, config.steps * 2 * config.pairs,
-        data.size.frames + data.size.pairs, f"{config.steps} steps", curve, told,
-    )  # fmt: skip
+        method,
+        _answers(data, encoder),
+        curve[-1].processor_s,
+        config.steps * 2 * config.pairs,
+        data.size.frames + data.size.pairs,
+        f"{config.steps} steps",
+        curve,
+        told,
+    )
 
 
 def streetfix_stock(data: PaperData) -> MethodResult:

@@ -65,23 +65,27 @@ def _head(data: PaperData) -> list[str]:
     return [
         "# The paper, reproduced",
         "",
-        f"Made by `make paper` at commit `{head_commit()[:10]}`; its figures come from the runs below. The paper's machine: Intel Core",
-        "i5-8250U, 8 GB, MATLAB; ours are named under *Runs*. CARLA is replaced by our simulator, so figures compare methods on one",
-        "city and not our city with theirs.",
+        f"`make paper` wrote this page at commit `{head_commit()[:10]}`. *Runs* lists the runs that measured the figures, with their",
+        "machines. The authors used an Intel Core i5-8250U with 8 GB and MATLAB. Our simulator replaces CARLA. So the figures compare",
+        "methods on one city. They do not compare our city with that of the paper.",
         "",
-        f"Data: {data.size.frames:,} LiDAR frames, {data.size.pairs:,} RGB-D pairs to learn from, {len(data.tests['other_drive'])} test",
-        f"images a split. Making them is in no method's training time; minutes of wall time on two cores beside other work: {made}.",
+        f"Data: {data.size.frames:,} LiDAR frames, {data.size.pairs:,} RGB-D training pairs, {len(data.tests['other_drive'])} test",
+        "images per split. No training time includes the time to make the data. Wall time to make them, in minutes, on two cores",
+        f"beside other work: {made}.",
     ]
 
 
 def _bars(rows: Rows) -> list[str]:
     """Return the bars of our method from the report."""
     lines = [
-        "## What ours must do", "",
-        "Lead every method on another drive, lie within the interval of the best on the survey's own, and train in fewer minutes for",
-        "the same images.", "",
-        "| row | ours | bar | holds |", "|---|---|---|---|",
-    ]  # fmt: skip
+        "## Requirements for our method",
+        "",
+        "On another drive, our method must be better than every other method. On the survey's own drive, it must lie within the",
+        "confidence interval of the best method. For the same number of images, it must train in fewer minutes.",
+        "",
+        "| row | ours | bar | holds |",
+        "|---|---|---|---|",
+    ]
     for row in rows:
         if "bar" in row:
             value = "-" if row["value"] is None else f"{row['value']:.4g}"
@@ -101,21 +105,31 @@ def _pictures(pictures: Mapping[str, str]) -> list[str]:
 
 def _network() -> list[str]:
     lines = [
-        "## Figure 9: the network", "",
-        "The figure's text names no layer. Counted are the types that the paper counts by: convolution, pooling, full connection.", "",
-        "| layer | does | output |", "|---|---|---|",
-    ]  # fmt: skip
+        "## Figure 9: the network",
+        "",
+        "The caption of the figure names no layer. As in the paper, we count convolution, pooling and fully connected layers.",
+        "",
+        "| layer | operation | output |",
+        "|---|---|---|",
+    ]
     return lines + [f"| {number} | {does} | {out} |" for number, does, out in layer_table()]
 
 
 def _how(budget_minutes: float) -> list[str]:
     plan = CnnPlan("aligned")
     text = Path(__file__).with_name("how_read.md").read_text()
-    told = text.format(
-        budget=budget_minutes, rate=plan.rate, batch=plan.batch, patience=PATIENCE, rows=SHAPE.rows, columns=SHAPE.columns,
-        widths=", ".join(map(str, SHAPE.widths)), side=PoseSettings().side, steps=MOST_STEPS,
-    )  # fmt: skip
-    return told.rstrip().split("\n")
+    filled = text.format(
+        budget=budget_minutes,
+        rate=plan.rate,
+        batch=plan.batch,
+        patience=PATIENCE,
+        rows=SHAPE.rows,
+        columns=SHAPE.columns,
+        widths=", ".join(map(str, SHAPE.widths)),
+        side=PoseSettings().side,
+        steps=MOST_STEPS,
+    )
+    return filled.rstrip().split("\n")
 
 
 def _runs(results: Mapping[str, MethodResult], pace: Pace | None) -> list[str]:
@@ -124,17 +138,22 @@ def _runs(results: Mapping[str, MethodResult], pace: Pace | None) -> list[str]:
     for name, result in results.items():
         if name not in ("cnn_knn", "cnn_softmax"):  # these stand for one of their variants
             lines.append(
-                f"| `{name}` | `{result.run.commit[:10]}` | {result.run.machine or 'not kept'} | {result.ended} |"
+                f"| `{name}` | `{result.run.commit[:10]}` | {result.run.machine or 'not recorded'} | {result.ended} |"
             )
     if pace is None:
         return lines
     ratios = pace.to_the_quickest()
     lines += [
-        "", (f"Steps of all learned methods in turn: commit `{pace.run.commit[:10]}`, {pace.run.machine}, load {pace.load[0]:.1f} before "
-        f"and {pace.load[1]:.1f} after. Ours to the quickest other method, round by round: "
-        f"{', '.join(f'{ratio:.2f}' for ratio in ratios)}."), "",
-        "| method | milliseconds an image, each round |", "|---|---|",
-    ]  # fmt: skip
+        "",
+        (
+            f"We timed training steps of all learned methods in turn: commit `{pace.run.commit[:10]}`, {pace.run.machine}, load "
+            f"{pace.load[0]:.1f} before and {pace.load[1]:.1f} after. Ratio of our time to that of the fastest other method, by round: "
+            f"{', '.join(f'{ratio:.2f}' for ratio in ratios)}."
+        ),
+        "",
+        "| method | milliseconds per image, by round |",
+        "|---|---|",
+    ]
     for name, times in pace.seconds_an_image.items():
         lines.append(f"| `{name}` | {', '.join(f'{1000 * each:.2f}' for each in times)} |")
     return lines

@@ -131,9 +131,14 @@ def all_rows(
             how = "by steps of all methods in turn in one run" if in_turn else "scaled from its own run"
             with report.made_by(pace.run if pace is not None and in_turn else results[method].run):
                 report.row(
-                    f"paper.{method}.minutes_for_paper_images", minutes, "min", bar=bar, better="lower", n=PAPER_IMAGES,
+                    f"paper.{method}.minutes_for_paper_images",
+                    minutes,
+                    "min",
+                    bar=bar,
+                    better="lower",
+                    n=PAPER_IMAGES,
                     why=f"processor minutes, {how}" + ("; bar: the quickest other learned method's" if bar else ""),
-                )  # fmt: skip
+                )
     for method, result in results.items():
         if method.startswith("cnn_knn_"):
             with report.made_by(result.run):
@@ -178,9 +183,15 @@ def _rows_of(
         bar, what = bars.get(key, (None, None))
         better: Literal["higher", "lower"] = "higher" if key == "street_accuracy" else "lower"
         report.row(
-            f"{row}.{key}", own[key], unit, bar=bar, better=better, n=n, ci95=interval if better == "higher" else None,
+            f"{row}.{key}",
+            own[key],
+            unit,
+            bar=bar,
+            better=better,
+            n=n,
+            ci95=interval if better == "higher" else None,
             why=None if what is None else f"bar: {what}",
-        )  # fmt: skip
+        )
     for key in ("median_distance_error_m", "within_1_m"):
         report.row(f"{row}.{key}", own[key], "m" if key.endswith("_m") and key != "within_1_m" else "share", n=n)
     minutes = None if result.training_s is None else result.training_s / 60

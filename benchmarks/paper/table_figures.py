@@ -46,7 +46,7 @@ def table_one(data: PaperData) -> Figure:
         (panels[0], FRAMES_PRINTED, here, "LiDAR frames"),
         (panels[1], TEST_IMAGES, asked, "test images (each of both drives)"),
     ):
-        axes.barh(at - 0.2, printed, 0.4, color=PRINTED, label="as the paper prints")
+        axes.barh(at - 0.2, printed, 0.4, color=PRINTED, label="as printed in the paper")
         axes.barh(at + 0.2, ours, 0.4, color=OURS, label="here")
         axes.set_title(title, fontsize=10)
         clean(axes)
@@ -73,8 +73,15 @@ def table_two(data: PaperData, results: Mapping[str, MethodResult]) -> Figure:
         for case, (title, _) in enumerate(TABLE_II):
             of_case = errors[street == CLASS_NAMES.index(title)]
             x = case + (k - (len(shown) - 1) / 2) * 0.36
-            axes.plot(x + rng.uniform(-0.12, 0.12, len(of_case)), of_case, ".", ms=4, alpha=0.45, color=colour,
-                      label=name if case == 0 else None)  # fmt: skip
+            axes.plot(
+                x + rng.uniform(-0.12, 0.12, len(of_case)),
+                of_case,
+                ".",
+                ms=4,
+                alpha=0.45,
+                color=colour,
+                label=name if case == 0 else None,
+            )
             if len(of_case):
                 axes.plot([x - 0.15, x + 0.15], [np.median(of_case)] * 2, color=INK, lw=1.6)
     axes.set_xticks(range(len(TABLE_II)), [title for title, _ in TABLE_II], fontsize=8)

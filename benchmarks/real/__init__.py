@@ -1,1 +1,1 @@
-"""``make evaluate-real`` -> reports/real_data.json: other people's recordings, and round trips through their formats."""
+"""``make evaluate-real`` -> reports/real_data.json: recordings of other groups, and round trips through formats."""

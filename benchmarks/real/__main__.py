@@ -21,13 +21,23 @@ BUILDS, FRAMES = 20, 100
 
 
 def resume_rows(report: Report, work: Path) -> None:
-    """Builds that are killed and started again."""
+    """Measure builds that are killed and started again.
+
+    Args:
+        report: receives the rows.
+        work: folder of datasets and maps.
+    """
     same = identical_bundles(simulated(work, street="8").folder, work / "resume", builds=BUILDS)
     report.row("resume.identical_bundles", float(sum(same)), "bundles", bar=BUILDS, n=BUILDS)
 
 
 def ros2_rows(report: Report, work: Path) -> None:
-    """Frames over DDS to the bridge in another process, which answers from the map itself."""
+    """Send frames over DDS to a bridge in another process. The bridge answers from the map bundle.
+
+    Args:
+        report: receives the rows.
+        work: folder of datasets and maps.
+    """
     dataset, bundle = simulated(work), work / "ros2_map"
     build_map(dataset, ENCODER, bundle, BuildSettings(name="ros2"), overwrite=True)
     frames = [(f.rgb(), f.depth_m(), f.camera.pinhole()) for f in dataset.queries(QUERIES)]
@@ -36,7 +46,7 @@ def ros2_rows(report: Report, work: Path) -> None:
 
 
 def main() -> None:
-    """Parse, measure, write the report."""
+    """Parse the arguments, measure the parts and write the report."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--data", type=Path, default=ROOT.parent / "shared" / "data", help="folder of the recordings")
     parser.add_argument("--work", type=Path, default=ROOT / "data" / "real", help="folder of datasets and maps")
@@ -52,7 +62,9 @@ def main() -> None:
         "resume": lambda report, a: resume_rows(report, a.work),
         "ros2": lambda report, a: ros2_rows(report, a.work),
     }
-    parser.add_argument("--only", nargs="+", choices=list(parts), help="parts to measure; the rows of the others stay")
+    parser.add_argument(
+        "--only", nargs="+", choices=list(parts), help="parts to measure; the rows of the other parts stay"
+    )
     parser.add_argument(
         "--drives", nargs="+", choices=DRIVES, default=list(DRIVES), help="drives of the part `streets`"
     )

@@ -1,4 +1,4 @@
-"""KITTI's recordings: imported, mapped with the stock encoder, and asked over HTTP."""
+"""Measure KITTI recordings: import them, build maps with the stock encoder, and send queries over HTTP."""
 
 import shutil
 from pathlib import Path
@@ -22,14 +22,20 @@ from model_training.stock import ENCODER
 from service.geometry.rigid import transform_from
 
 DRIVE = Path("2011_09_26") / "2011_09_26_drive_sync"
-LIDAR_HEIGHT_M = 1.73  # as KITTI's own figure of its car has it
+LIDAR_HEIGHT_M = 1.73  # from KITTI's drawing of its vehicle
 SETTINGS = OpenSettings(depth="lidar")
-IN_SIGHT = "not held out: the vote on traffic was chosen with these frames in sight"
+NOT_HELD_OUT = "not held out: the traffic vote was chosen on these frames"
 NO_DATA = "no recordings at {name}"
 
 
 def drive_rows(report: Report, data: Path, work: Path) -> None:
-    """``kitti_drive``: every other scan is the map, the frames between are asked; then the other way round."""
+    """Add the rows ``kitti_drive``: every second scan makes the map, and the frames between are queries; then with both swapped.
+
+    Args:
+        report: receives the rows.
+        data: folder of the recordings.
+        work: folder of datasets and maps.
+    """
     source = data / "kitti_drive" / DRIVE
     if not source.exists():
         for row, unit in (("within_1_m", "share"), ("median_m", "m"), ("odometry_vs_reference_m", "m")):
@@ -52,11 +58,19 @@ def drive_rows(report: Report, data: Path, work: Path) -> None:
         report.row(f"kitti_drive.{name}_poses.median_m", float(np.median(error_m)), "m", n=len(error_m))
     both = np.concatenate(list(errors.values()))
     report.share("kitti_drive.within_1_m", both <= 1.0, bar=1.0)
-    report.row("kitti_drive.median_m", float(np.median(both)), "m", bar=0.12, better="lower", n=len(both), why=IN_SIGHT)
+    report.row(
+        "kitti_drive.median_m", float(np.median(both)), "m", bar=0.12, better="lower", n=len(both), why=NOT_HELD_OUT
+    )
 
 
 def stereo_rows(report: Report, data: Path, work: Path) -> None:
-    """``kitti_stereo``: the places of all frames in one map, the stereo frames asked with SGBM's depth."""
+    """Add the rows ``real.kitti_stereo``: one map of all scans, and stereo frames with SGBM depth as queries.
+
+    Args:
+        report: receives the rows.
+        data: folder of the recordings.
+        work: folder of datasets and maps.
+    """
     source = data / "kitti_stereo"
     if not source.exists():
         report.row("real.kitti_stereo.answered_within_1_m", None, "share", bar=1.0, why=NO_DATA.format(name=data.name))
@@ -73,7 +87,7 @@ def stereo_rows(report: Report, data: Path, work: Path) -> None:
 
 
 def _both_halves(source: Path, poses: Trajectory, work: Path, reference: Path) -> NDArray[np.float64]:
-    """Distances (m) of all frames' answers from the reference, each frame asked of the map that lacks it."""
+    """Return the distances (n,) of the answers from the reference, metres. Each frame is a query to the map without its scan."""
     away = []
     for first in (0, 1):
         folder, bundle = work.with_name(f"{work.name}_{first}"), work.with_name(f"{work.name}_{first}_map")
@@ -92,9 +106,9 @@ def _both_halves(source: Path, poses: Trajectory, work: Path, reference: Path) -
 
 
 def _in_frame_of(trajectory: Trajectory, stamps_s: NDArray[np.float64], T_reference: NDArray[np.float64]) -> Trajectory:
-    """The trajectory moved as a whole to where the reference is in the mean: a map's frame is nobody's measurement.
+    """Return the trajectory after a rigid alignment to the reference, because the frames of odometry and reference differ.
 
-    The drive is straight, so positions alone would leave the roll open: the rotation is the mean of the poses' own.
+    Rotation: the mean rotation between the poses. On a straight drive, positions alone do not determine the roll.
     """
     T = trajectory.between(stamps_s)
     turns = T_reference[:, :3, :3] @ T[:, :3, :3].transpose(0, 2, 1)

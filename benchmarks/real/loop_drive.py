@@ -1,4 +1,4 @@
-"""A drive round the blocks of a simulated city, as a recording without poses: what loop closure is measured on."""
+"""A simulated drive around city blocks, as a recording without poses, to measure loop closure."""
 
 from collections.abc import Iterator
 from itertools import pairwise
@@ -20,17 +20,17 @@ from model_training.simulation.sensor_parameters import LidarParameters
 from model_training.simulation.traversal import Station, lidar_pose
 
 SPEED_M_S = 10.0
-#: Ways are averaged over so much, twice: a vehicle turns in circles of 5 m and more.
+#: Window of the moving average over the path, metres, applied twice. A vehicle turns with a radius of 5 m or more.
 CORNER_M = 12.0
 
 
 class LoopDrive:
-    """A vehicle that drives along a city's streets, turning at crossings, for a given length.
+    """A vehicle that follows the streets of a city and turns at crossings.
 
     Args:
-        seed: of the city and the drive.
-        length_m: of the drive.
-        step_m: between scans.
+        seed: seed of the city and of the drive.
+        length_m: length of the drive, metres.
+        step_m: distance between scans, metres.
     """
 
     kind = "simulated drive"
@@ -53,16 +53,20 @@ class LoopDrive:
         self._seed = seed
 
     def count(self) -> int:
-        """Scans."""
+        """Return the number of scans."""
         return len(self.stamps_s)
 
     def trajectory(self) -> Trajectory | None:
-        """None: that is the point."""
+        """Return None: the recording has no poses."""
         return None
 
     def events(self, *, pictures: bool = True) -> Iterator[Event]:
-        """Scans, cast as they are asked for."""
-        del pictures  # it takes none
+        """Yield the scans. Each is simulated when it is needed.
+
+        Args:
+            pictures: without effect; the recording has no images.
+        """
+        del pictures
         scene = Scene(joined([self._city.static, self._city.occupants(0)]))
         model = LidarParameters().on("paper_32")
         rays = model.rays()
@@ -73,7 +77,7 @@ class LoopDrive:
 
 
 def _walk(city: City, length_m: float, rng: np.random.Generator) -> NDArray[np.float64]:
-    """Points along streets from crossing to crossing, each street piece as seldom as may be, never straight back."""
+    """Return points (n, 2) of a path along streets, metres. At each crossing it takes the least used piece and never turns back."""
     lines = [shapely.LineString(line) for street in city.streets for line in street.lines]
     pieces = [np.array(piece.coords) for piece in shapely.get_parts(shapely.node(shapely.MultiLineString(lines)))]
     ends: dict[tuple[float, float], list[NDArray[np.float64]]] = {}
@@ -104,7 +108,7 @@ def _piece(way: NDArray[np.float64]) -> frozenset[tuple[float, float]]:
 
 
 def _rounded(line: NDArray[np.float64], step_m: float) -> NDArray[np.float64]:
-    """The same way at even steps, corners rounded by a mean over ``CORNER_M``."""
+    """Resample a path (n, 2) to steps of ``step_m`` and smooth its corners by a moving average over ``CORNER_M``."""
     along = np.r_[0.0, np.cumsum([float(np.linalg.norm(b - a)) for a, b in pairwise(line)])]
     at = np.arange(0.0, along[-1], step_m)
     even = np.stack([np.interp(at, along, line[:, axis]) for axis in range(2)], axis=1)

@@ -1,4 +1,4 @@
-"""A simulated survey without poses: how far off it is by odometry alone, and with its loops closed."""
+"""Measure the drift of a simulated survey without poses: by odometry alone, and with loop closure."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,7 +11,11 @@ SEED, LENGTH_M = 9101, 1500.0
 
 
 def loop_rows(report: Report) -> None:
-    """Root of the mean squared distance from the truth, trajectories aligned as a whole (what ``evo_ape --align`` gives)."""
+    """Add the position RMSE after rigid alignment, as ``evo_ape --align`` computes it, before and after loop closure.
+
+    Args:
+        report: receives the rows.
+    """
     drive = LoopDrive(SEED, length_m=LENGTH_M)
     found = find_trajectory(drive, report=lambda stage, done, of: print(f"\r{stage} {done}/{of}", end="", flush=True))
     print()
@@ -23,7 +27,12 @@ def loop_rows(report: Report) -> None:
 
 
 def aligned_error_m(estimated: NDArray[np.float64], truth: NDArray[np.float64]) -> float:
-    """RMSE after the rigid alignment that makes it smallest (Umeyama 1991, without scale)."""
+    """Return the RMSE after the rigid alignment that minimises it (Umeyama 1991, without scale), metres.
+
+    Args:
+        estimated: positions (n, 3), metres.
+        truth: ground-truth positions (n, 3), metres.
+    """
     a, b = estimated - estimated.mean(axis=0), truth - truth.mean(axis=0)
     u, _, vt = np.linalg.svd(b.T @ a)
     R = u @ np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ vt))]) @ vt

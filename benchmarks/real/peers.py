@@ -1,7 +1,7 @@
-"""``real.peers.*``: other methods on the same queries and the same map, forced, beside ours forced and ours with the status applied.
+"""Rows ``real.peers.*``: other methods on the same queries and map. Their figures are forced. Ours are forced and with status.
 
-Retrieval methods answer the place that is nearest; registration methods answer a pose. A peer whose library is not installed keeps
-the row of an earlier run. If there is none, its row says so.
+Retrieval methods return the most similar place. Registration methods return a pose. If the library of a method is not installed, the
+row of an earlier run stays. Without such a row, the row gives the reason.
 """
 
 import time
@@ -33,11 +33,11 @@ Locate = Callable[[QueryFrame, int], Transform | None]
 
 
 def pooled_rows(report: Report, drives: list[tuple[float, float, int]]) -> None:
-    """Of all drives: the best other method of each, and ours, within 1 m, weighted by queries.
+    """Add the shares within 1 m over all drives, weighted by queries: the best other method of each drive, and ours.
 
     Args:
-        report: where to.
-        drives: what ``peer_rows`` returned of each.
+        report: receives the rows.
+        drives: result of ``peer_rows`` for each drive.
     """
     if not drives:
         return
@@ -52,17 +52,20 @@ def pooled_rows(report: Report, drives: list[tuple[float, float, int]]) -> None:
 def peer_rows(
     report: Report, name: str, dataset: Dataset, localizer: Localizer, query_set: str
 ) -> tuple[float, float, int]:
-    """Every method on one drive.
+    """Run every method on one drive and add its rows.
 
     Args:
-        report: where to.
-        name: of the drive, part of the rows' ids.
-        dataset: the drive's.
-        localizer: of its map.
-        query_set: with truth.
+        report: receives the rows.
+        name: name of the drive, part of the row ids.
+        dataset: dataset of the drive.
+        localizer: localizer of its map.
+        query_set: name of a query set with ground truth.
 
     Returns:
-        Shares within 1 m of the best other method and of ours, forced; how many queries.
+        Forced share within 1 m of the best other method, that of our method, and the number of queries.
+
+    Raises:
+        ValueError: the map has no cloud.
     """
     frames = list(dataset.queries(query_set))
     true_xy = np.array([frame.T_map_camera[:2, 3] for frame in frames if frame.T_map_camera is not None])
@@ -123,7 +126,7 @@ def peer_rows(
 def _by_raw_range(
     localizer: Localizer, dataset: Dataset, query_set: str, true_xy: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """The place of the nearest range view, by the setting that does best on these very queries: what an honest method must beat."""
+    """Return the places (n, 2) of the most similar range views, metres, with the best setting for these queries: an upper bound."""
     found = raw_best_views(localizer.bundle, dataset, [query_set])
     places = localizer.bundle.T_map_place[:, :2, 3]
 
@@ -136,14 +139,14 @@ def _by_raw_range(
 
 
 def _by_scan_context(dataset: Dataset, frames: list[QueryFrame]) -> NDArray[np.float64]:
-    """The scan whose context is nearest."""
+    """Return the positions (n, 2) of the scans with the most similar context, metres."""
     settings, poses = ContextSettings(), dataset.survey_poses()
     contexts = []
     for number, T_map_lidar in enumerate(poses):
         points = dataset.scan(number)[:, :3].astype(np.float64) @ T_map_lidar[:3, :3].T
         low = np.percentile(points[np.hypot(*points[:, :2].T) < 10][:, 2], 5)  # the ground around the vehicle
         contexts.append(context_of(points - [0.0, 0.0, low], settings))
-    asked = [context_of_depth(frame.depth_m(), frame.camera.pinhole(), settings) for frame in frames]
-    nearest = similarities(np.stack(asked), np.stack(contexts)).argmax(axis=1)
+    queries = [context_of_depth(frame.depth_m(), frame.camera.pinhole(), settings) for frame in frames]
+    nearest = similarities(np.stack(queries), np.stack(contexts)).argmax(axis=1)
     xy: NDArray[np.float64] = poses[nearest, :2, 3]
     return xy

@@ -1,6 +1,6 @@
-"""Builds that are killed at a random moment and started again: is the bundle the same, byte for byte?
+"""Kill map builds at random times, start them again, and compare the bundles byte by byte.
 
-The command itself, in a process of its own, as a person starts it; SIGKILL for its whole group, so nothing gets to tidy up.
+The build is the real command in its own process. SIGKILL goes to its whole process group, so no process can clean up.
 """
 
 import json
@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 
 MANIFEST = "manifest.json"
-#: What says when, not what.
+#: Fields of the manifest that differ between equal bundles.
 _TIMESTAMPS = ("made_at",)
 _COMMAND = (sys.executable, "-c", "from service.cli.main import main; main()", "build-map")
 
@@ -27,17 +27,16 @@ def identical_bundles(
 
     Args:
         dataset: folder of a dataset with a survey.
-        work: folder for the bundles; those of a former run are removed.
-        builds: how many are killed, each once, at a moment drawn uniformly over the time that the undisturbed one took.
-        seed: of the moments.
-        options: further ones of ``build-map``.
+        work: folder of the bundles. Bundles of an earlier run are removed.
+        builds: number of builds. Each is killed once, at a random time within the duration of an undisturbed build.
+        seed: seed of the times.
+        options: further options of ``build-map``.
 
     Returns:
-        For each build 1 if all files are those of the undisturbed one but for timestamps, else 0: their sum is the number of identical
-        ones.
+        For each build 1 if all files equal those of the undisturbed build except for timestamps, else 0.
 
     Raises:
-        RuntimeError: a build fails of itself, or leaves half a bundle.
+        RuntimeError: a build fails without a kill, or leaves an incomplete bundle.
     """
     rng = np.random.default_rng(seed)
     shutil.rmtree(work, ignore_errors=True)
@@ -61,22 +60,31 @@ def identical_bundles(
 
 def _built(dataset: Path, out: Path, options: tuple[str, ...], *, kill_after_s: float | None) -> None:
     arguments = [*_COMMAND, str(dataset), "--out", str(out), "--name", "resumed", *options]
-    # A group of its own, so that the kill reaches every process of the build and no other.
+    # Its own process group: the kill reaches every process of the build and no other process.
     process = subprocess.Popen(
-        arguments, stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, start_new_session=True, text=True
-    )  # fmt: skip
+        arguments,
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.PIPE,
+        start_new_session=True,
+        text=True,
+    )
     try:
-        _, told = process.communicate(timeout=kill_after_s)
+        _, errors = process.communicate(timeout=kill_after_s)
     except subprocess.TimeoutExpired:
         os.killpg(process.pid, signal.SIGKILL)
         process.communicate()
         return
     if process.returncode != 0:
-        raise RuntimeError(f"build-map ended with {process.returncode}: {told[-2000:]}")
+        raise RuntimeError(f"build-map ended with {process.returncode}: {errors[-2000:]}")
 
 
 def content_of(bundle: Path) -> dict[str, bytes]:
-    """Every file by its name; of the manifest all but its timestamps."""
+    """Return the content of every file by name. Timestamps of the manifest are removed.
+
+    Args:
+        bundle: folder of a map bundle.
+    """
     files = {path.relative_to(bundle).as_posix(): path for path in sorted(bundle.rglob("*")) if path.is_file()}
     content = {name: path.read_bytes() for name, path in files.items()}
     manifest = json.loads(content[MANIFEST])

@@ -1,4 +1,4 @@
-"""Frames as a robot sends them, over DDS on loopback, to a bridge in another process; counted are the answers that come back."""
+"""Send frames over DDS on loopback to a bridge in another process, as a robot does, and count the answers."""
 
 import itertools
 import os
@@ -27,12 +27,12 @@ from service.errors import UnreachableError
 from service.geometry.camera import PinholeCamera
 
 Pictures = tuple[NDArray[np.uint8], NDArray[np.float32], PinholeCamera]
-#: Discovery and data on loopback alone, without multicast, which not every container has.
+#: Discovery and data use loopback only, without multicast, because some containers have no multicast.
 LOOPBACK = """<CycloneDDS><Domain>
 <General><Interfaces><NetworkInterface name="lo"/></Interfaces><AllowMulticast>false</AllowMulticast></General>
 <Discovery><ParticipantIndex>auto</ParticipantIndex><Peers><Peer address="127.0.0.1"/></Peers></Discovery>
 </Domain></CycloneDDS>"""
-#: Frames that are under way at once; more would lie in queues.
+#: Largest number of frames without an answer. More would wait in queues.
 _UNDER_WAY = 4
 _FIRST_NS, _PERIOD_NS = 1_700_000_000 * 10**9, 10**8
 
@@ -40,84 +40,96 @@ _FIRST_NS, _PERIOD_NS = 1_700_000_000 * 10**9, 10**8
 def answers_over_dds(
     url_or_bundle: str, frames: Iterable[Pictures], count: int = 100, *, patience_s: float = 60.0
 ) -> int:
-    """How many of the frames that were sent came back as poses with their stamps, or as diagnoses that the answer has no pose.
+    """Send frames and return the number of answers: poses with the stamp of a frame, or diagnostics of an answer without a pose.
 
-    The bridge is the command itself, without its limits on rate and confidence.
+    The bridge is the real command, without limits of rate and confidence.
 
     Args:
-        url_or_bundle: a service's address, or the folder of a map bundle, which the bridge then answers from by itself.
-        frames: colour (H, W, 3), depth (H, W) in metres, and camera; from the start again where there are fewer than ``count``.
-        count: frames to send.
-        patience_s: end where nothing has come back for so long.
+        url_or_bundle: address of a service, or folder of a map bundle that the bridge answers from.
+        frames: colour (H, W, 3), depth (H, W) in metres, and camera. They repeat if there are fewer than ``count``.
+        count: number of frames to send.
+        patience_s: longest wait without a message, seconds.
 
     Raises:
-        UnreachableError: the bridge has ended, or was never heard of.
+        UnreachableError: the bridge has ended, or sent no message.
     """
-    domain = 20 + os.getpid() % 200  # two at once on a machine are not to hear each other
+    domain = 20 + os.getpid() % 200  # two runs on one machine must not receive each other's messages
     with _bridge(url_or_bundle, domain) as process:
         robot = Robot(domain)
-        robot.meet(process, patience_s)
+        robot.connect(process, patience_s)
         for number, frame in enumerate(itertools.islice(itertools.cycle(frames), count)):
             robot.send(frame, _FIRST_NS + number * _PERIOD_NS)
-            if not robot.wait(lambda sent=number + 1: robot.asked > sent - _UNDER_WAY, patience_s):
+            if not robot.wait(lambda sent=number + 1: robot.queries > sent - _UNDER_WAY, patience_s):
                 break
-        robot.wait(lambda: robot.asked >= robot.sent and len(robot.posed) >= robot.published, patience_s)
+        robot.wait(lambda: robot.queries >= robot.sent and len(robot.posed) >= robot.published, patience_s)
     return len(robot.posed) + robot.refused
 
 
 class Robot:
-    """The other end: a camera's topics out, poses and diagnostics in.
+    """Robot that publishes the topics of a camera and receives poses and diagnostics.
+
+    Args:
+        domain: DDS domain.
 
     Attributes:
-        sent: frames.
-        posed: stamps of poses that came for them.
-        asked, published: what the bridge says of itself.
-        refused: diagnoses of answers that are not LOCALIZED.
+        posed: stamps of the received poses, nanoseconds.
+        queries: number of queries that the bridge reports.
+        published: number of poses that the bridge reports.
+        refused: number of diagnostics of answers that are not LOCALIZED.
     """
 
     def __init__(self, domain: int) -> None:
-        self._domain = Domain(domain, LOOPBACK)  # this process' environment stays as it is
+        self._domain = Domain(domain, LOOPBACK)  # leaves the environment of this process unchanged
         self._participant = DomainParticipant(domain)
         topics = Topics()
         self._color = self._of(DataWriter, topics.color, messages.Image)
         self._depth = self._of(DataWriter, topics.depth, messages.Image)
         self._info = self._of(DataWriter, topics.info, messages.CameraInfo)
-        # Made before that of the diagnostics: who hears of this robot's second reader has heard of the first.
+        # This reader exists before that of the diagnostics. So a bridge that knows the second reader knows the first too.
         self._poses = self._of(DataReader, topics.pose, messages.PoseWithCovarianceStamped)
         self._diagnostics = self._of(DataReader, topics.diagnostics, messages.DiagnosticArray)
         self._waiting = WaitSet(self._participant)
         for reader in (self._poses, self._diagnostics):
             self._waiting.attach(ReadCondition(reader, SampleState.Any | ViewState.Any | InstanceState.Any))
-        self.asked = self.published = self.refused = 0
+        self.queries = self.published = self.refused = 0
         self._stamps: set[int] = set()
         self.posed: set[int] = set()
-        self._met = False
+        self._has_diagnostics = False
 
     @property
     def sent(self) -> int:
-        """Frames."""
+        """Number of sent frames."""
         return len(self._stamps)
 
-    def meet(self, process: "subprocess.Popen[bytes]", patience_s: float) -> None:
-        """Wait until the bridge hears all that is sent, and what it says is heard.
+    def connect(self, process: "subprocess.Popen[bytes]", patience_s: float) -> None:
+        """Wait until the bridge subscribes to all topics and its diagnostics arrive.
+
+        Args:
+            process: process of the bridge.
+            patience_s: longest wait without a message, seconds.
 
         Raises:
-            UnreachableError: it has ended, or is not heard.
+            UnreachableError: the bridge has ended, or sends no diagnostics.
         """
 
-        def know() -> bool:
+        def is_connected() -> bool:
             if process.poll() is not None:
                 raise UnreachableError(f"the bridge ended with {process.returncode}; see its messages above")
             writers = (self._color, self._depth, self._info)
-            return self._met and all(writer.get_matched_subscriptions() for writer in writers)
+            return self._has_diagnostics and all(writer.get_matched_subscriptions() for writer in writers)
 
-        if not self.wait(know, patience_s):
+        if not self.wait(is_connected, patience_s):
             raise UnreachableError(
                 f"no message from the bridge within {patience_s:g} s; check that this machine has a loopback interface"
             )
 
     def send(self, frame: Pictures, stamp_ns: int) -> None:
-        """One frame as a driver sends it."""
+        """Send one frame as a camera driver does.
+
+        Args:
+            frame: colour (H, W, 3), depth (H, W) in metres, and camera.
+            stamp_ns: stamp of all messages, nanoseconds.
+        """
         rgb, depth_m, camera = frame
         header = messages.Header(stamp_message(stamp_ns), "camera_color_optical_frame")
         k = [camera.fx, 0.0, camera.cx, 0.0, camera.fy, camera.cy, 0.0, 0.0, 1.0]
@@ -132,27 +144,32 @@ class Robot:
         self._depth.write(_image(header, "32FC1", depth_m.astype("<f4", copy=False)))
 
     def wait(self, until: Any, patience_s: float) -> bool:
-        """Listen until a condition holds; False where nothing has come for so long."""
-        heard_s = time.monotonic()
+        """Receive messages until a condition holds; return False if no message arrives for ``patience_s``.
+
+        Args:
+            until: the condition, a function without arguments.
+            patience_s: longest wait without a message, seconds.
+        """
+        last_message_s = time.monotonic()
         while not until():
             self._waiting.wait(duration(milliseconds=200))
-            if self._listen():
-                heard_s = time.monotonic()
-            elif time.monotonic() - heard_s > patience_s:
+            if self._receive():
+                last_message_s = time.monotonic()
+            elif time.monotonic() - last_message_s > patience_s:
                 return False
         return True
 
-    def _listen(self) -> bool:
-        """Take what has come; whether it was news."""
-        before = (self._met, self.asked, len(self.posed))
+    def _receive(self) -> bool:
+        """Take the received messages; return whether they change the counts."""
+        before = (self._has_diagnostics, self.queries, len(self.posed))
         for pose in self._poses.take(N=100):
             self.posed |= {nanoseconds_of(pose)} & self._stamps
         for array in self._diagnostics.take(N=100):
-            self._met = True
-            told = {value.key: value.value for value in array.status[0].values}
-            self.asked, self.published = int(told["asked"]), int(told["published"])
-            self.refused += told.get("status") in ("AMBIGUOUS", "OUT_OF_MAP")
-        return (self._met, self.asked, len(self.posed)) != before
+            self._has_diagnostics = True
+            values = {value.key: value.value for value in array.status[0].values}
+            self.queries, self.published = int(values["queries"]), int(values["published"])
+            self.refused += values.get("status") in ("AMBIGUOUS", "OUT_OF_MAP")
+        return (self._has_diagnostics, self.queries, len(self.posed)) != before
 
     def _of(self, end: Any, topic: str, kind: type) -> Any:
         return end(
@@ -172,13 +189,24 @@ def _image(header: messages.Header, encoding: str, picture: NDArray[Any]) -> mes
 
 @contextmanager
 def _bridge(url_or_bundle: str, domain: int) -> "Iterator[subprocess.Popen[bytes]]":
-    """The command in a process of its own, which Ctrl-C ends."""
+    """Run the command in its own process; SIGINT ends it."""
     where = ["--url" if "://" in url_or_bundle else "--map", url_or_bundle]
     open_gates = ["--rate", "0", "--min-confidence", "0", "--reliable", "--queue", "0"]
     process = subprocess.Popen(
-        [sys.executable, "-c", "from service.cli.main import main; main()", "bridge", "ros2", *where, "--domain", str(domain), *open_gates],
-        env=os.environ | {"CYCLONEDDS_URI": LOOPBACK}, stdout=subprocess.DEVNULL,
-    )  # fmt: skip
+        [
+            sys.executable,
+            "-c",
+            "from service.cli.main import main; main()",
+            "bridge",
+            "ros2",
+            *where,
+            "--domain",
+            str(domain),
+            *open_gates,
+        ],
+        env=os.environ | {"CYCLONEDDS_URI": LOOPBACK},
+        stdout=subprocess.DEVNULL,
+    )
     try:
         yield process
     finally:

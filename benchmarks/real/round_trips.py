@@ -1,4 +1,4 @@
-"""A simulated dataset written in other people's formats and imported again: what the way there and back costs."""
+"""Write a simulated dataset in other formats, import it again, and measure what changes."""
 
 import json
 import shutil
@@ -25,23 +25,33 @@ from service.localization.localizer import Localizer
 from service.maps.reader import MapBundle
 
 QUERIES = "drive1_precise"
-#: Scans of the bags whose import is timed, and whose memory is compared.
+#: Numbers of scans of the two bags that are imported to measure time and memory.
 SHORT, LONG = 500, 5000
 
 
 def round_trip_rows(report: Report, work: Path) -> None:
-    """Answers after the way there and back against those before."""
+    """Add the largest difference between answers before and after the round trip, for each format.
+
+    Args:
+        report: receives the rows.
+        work: folder of datasets and maps.
+    """
     original = simulated(work)
     expected = _answers(original, QUERIES, work / "round_trip_map")
     for kind in ("mcap", "bag", "kitti"):
-        again = _there_and_back(original, kind, work)
+        again = _round_trip(original, kind, work)
         found = _answers(again, "recorded", work / f"round_trip_{kind}_map")
         away = np.linalg.norm(found[:, :3, 3] - expected[:, :3, 3], axis=1)
         report.row(f"roundtrip.{kind}.pose_difference_m", float(away.max()), "m", bar=0.01, better="lower", n=len(away))
 
 
 def import_rows(report: Report, work: Path) -> None:
-    """Scans a second out of a bag, and what ten times as many take in memory."""
+    """Add the import rate of a bag (scans per second), and the growth of memory from ``SHORT`` to ``LONG`` scans.
+
+    Args:
+        report: receives the rows.
+        work: folder of datasets.
+    """
     original = simulated(work)
     peaks, rates = {}, {}
     for scans in (SHORT, LONG):
@@ -49,7 +59,7 @@ def import_rows(report: Report, work: Path) -> None:
         for path in (bag, out):
             shutil.rmtree(path, ignore_errors=True)
         _repeated(original, scans, bag)
-        rates[scans], peaks[scans] = _import_apart(bag, out)
+        rates[scans], peaks[scans] = _import_in_process(bag, out)
         for path in (bag, out):
             shutil.rmtree(path)
     report.row("import.scans_per_s", rates[LONG], "1/s", bar=50, n=LONG)
@@ -59,15 +69,20 @@ def import_rows(report: Report, work: Path) -> None:
 
 
 def simulated(work: Path, street: str = "1") -> Dataset:
-    """A street of the paper's city and one query drive, kept in ``work``."""
-    asked = QueryPlan(name="drive1", traversal=1, count=40, depths=("precise",))
-    plan = SimulationPlan(name=f"street-{street}", city="paper", seed=9090, streets=(street,), queries=(asked,))
+    """Simulate one street of the paper's city with one query drive.
+
+    Args:
+        work: folder of datasets.
+        street: name of the street.
+    """
+    query = QueryPlan(name="drive1", traversal=1, count=40, depths=("precise",))
+    plan = SimulationPlan(name=f"street-{street}", city="paper", seed=9090, streets=(street,), queries=(query,))
     folder = work / plan.name
     simulate(plan, folder)
     return Dataset(folder)
 
 
-def _there_and_back(original: Dataset, kind: str, work: Path) -> Dataset:
+def _round_trip(original: Dataset, kind: str, work: Path) -> Dataset:
     suffix = ".bag" if kind == "bag" else "_there"
     there, back = work / f"round_trip_{kind}{suffix}", work / f"round_trip_{kind}"
     for path in (there, back):
@@ -81,10 +96,10 @@ def _there_and_back(original: Dataset, kind: str, work: Path) -> Dataset:
     else:
         write_bag(original, QUERIES, there, kind="mcap" if kind == "mcap" else "bag", report=lambda *_: None)
         recording = open_recording("rosbag", there, OpenSettings())
-        told = recording.trajectory()
-        if told is None:
+        trajectory = recording.trajectory()
+        if trajectory is None:
             raise RuntimeError(f"the bag of {kind} was read back without its poses")
-        poses = told
+        poses = trajectory
     take(recording, poses, back, TakeSettings())
     return Dataset(back)
 
@@ -96,7 +111,7 @@ def _answers(dataset: Dataset, queries: str, bundle: Path) -> np.ndarray:
 
 
 class _Repeated(Dataset):
-    """A dataset whose survey is driven again and again, for a long bag."""
+    """A dataset whose survey repeats, for a long bag."""
 
     def __init__(self, folder: Path, scans: int) -> None:
         super().__init__(folder)
@@ -115,8 +130,8 @@ def _repeated(original: Dataset, scans: int, out: Path) -> None:
     write_bag(_Repeated(original.folder, scans), None, out, kind="mcap", report=lambda *_: None)
 
 
-def _import_apart(bag: Path, out: Path) -> tuple[float, float]:
-    """Scans a second and the peak of memory (MiB) of the real command, in a process of its own."""
+def _import_in_process(bag: Path, out: Path) -> tuple[float, float]:
+    """Run the import command in its own process; return scans per second and peak memory (MiB)."""
     code = (
         "import resource, sys, json, time\n"
         "from service.cli.main import main\n"

@@ -1,4 +1,4 @@
-"""Query sets of a dataset asked over HTTP of a service that serves one map."""
+"""Send the query sets of a dataset over HTTP to a service with one map."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,12 +17,12 @@ _TIMEOUT_S = 60.0
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Served:
-    """The answers of a service, one row per query.
+    """Answers of a service, one row per query.
 
     Attributes:
-        T_map_camera: of the best hypothesis, whatever the status (n, 4, 4); infinite where there is none.
-        localized: whether the answer is accepted (n).
-        confidence: NaN where there is none (n).
+        T_map_camera: pose of the best hypothesis for any status (n, 4, 4), metres; infinite without a hypothesis.
+        localized: whether the answer is accepted (n,).
+        confidence: confidence of the answer (n,); NaN if there is none.
     """
 
     T_map_camera: NDArray[np.float64]
@@ -31,11 +31,17 @@ class Served:
 
 
 def served(bundle: Path, dataset: Dataset, queries: str) -> Served:
-    """Send every query of a set over HTTP: the files, the intrinsics and the depth format of the dataset."""
+    """Send every query of a set over HTTP, with the files, intrinsics and depth format of the dataset.
+
+    Args:
+        bundle: folder of the map bundle to serve.
+        dataset: dataset with the queries.
+        queries: name of the query set.
+    """
     poses, localized, confidence = [], [], []
     with serving(bundle, 0) as service, httpx.Client(base_url=service.url, timeout=_TIMEOUT_S) as client:
-        for asked in payloads(dataset, queries, map_name=None, refine=True, most=1_000_000):
-            reply = client.post("/v1/localize", content=asked.body, headers={"Content-Type": asked.content_type})
+        for payload in payloads(dataset, queries, map_name=None, refine=True, most=1_000_000):
+            reply = client.post("/v1/localize", content=payload.body, headers={"Content-Type": payload.content_type})
             answer = reply.raise_for_status().json()
             pose = answer["hypotheses"][0]["pose"] if answer["hypotheses"] else answer["pose"]
             localized.append(answer["status"] == "LOCALIZED")
@@ -45,11 +51,16 @@ def served(bundle: Path, dataset: Dataset, queries: str) -> Served:
 
 
 def _transform(pose: dict[str, dict[str, float]]) -> NDArray[np.float64]:
-    position, turned = pose["position"], pose["orientation"]
-    R = rotation_from_quaternion_xyzw(np.array([turned[axis] for axis in "xyzw"]))
+    position, orientation = pose["position"], pose["orientation"]
+    R = rotation_from_quaternion_xyzw(np.array([orientation[axis] for axis in "xyzw"]))
     return transform_from(R, np.array([position[axis] for axis in "xyz"]))
 
 
 def away_m(T: NDArray[np.float64], T_true: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Distances (n) between positions."""
+    """Return the distances (n,) between positions, metres.
+
+    Args:
+        T: poses (n, 4, 4).
+        T_true: ground-truth poses (n, 4, 4).
+    """
     return np.asarray(np.linalg.norm(T[:, :3, 3] - T_true[:, :3, 3], axis=1))

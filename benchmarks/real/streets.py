@@ -1,7 +1,7 @@
-"""Drives along real streets as a user gets them: import, map and answers at their defaults, figures with the status applied.
+"""Measure drives along real streets with default settings of import, map and localization.
 
-``real.DRIVE.answered_*`` and ``median_m`` are of answers that were accepted; what is called forced is the best guess of every query,
-whatever its status. Both stand in the report.
+``real.DRIVE.answered_*`` and ``median_m`` count accepted answers only. Forced figures count the best hypothesis of every query, with any
+status. The report has both.
 """
 
 import shutil
@@ -41,7 +41,13 @@ _ANSWERED, _WRONG, _MEDIAN_M, _RECALL_5M, _RECALL_10M, _INLIERS = 0.95, 0.02, 0.
 
 @dataclass(frozen=True)
 class Street:
-    """A drive that was imported and mapped."""
+    """A drive with its dataset and the localizer of its map.
+
+    Attributes:
+        name: name of the drive.
+        dataset: imported dataset.
+        localizer: localizer of its map.
+    """
 
     name: str
     dataset: Dataset
@@ -49,7 +55,14 @@ class Street:
 
 
 def street_rows(report: Report, data: Path, work: Path, drives: tuple[str, ...] = DRIVES) -> None:
-    """Each drive on its own map; then each one's queries on the other's map, where they are strangers."""
+    """Add the rows of each drive on its own map, and the accepted share of its queries on the other map (out-of-map queries).
+
+    Args:
+        report: receives the rows.
+        data: folder of the recordings.
+        work: folder of datasets and maps.
+        drives: names of the drives.
+    """
     streets = [street for name in drives if (street := _street(report, data, work, name)) is not None]
     others = []
     for street in streets:
@@ -71,11 +84,11 @@ def street_rows(report: Report, data: Path, work: Path, drives: tuple[str, ...] 
 
 
 def answer_rows(report: Report, row: str, found: Predictions, *, bars: bool = True) -> None:
-    """Add rows of a query set: recall, answers by their status, and beside them the same answers forced.
+    """Add the rows of a query set: recall, figures by status, and forced figures.
 
     Args:
-        report: where to.
-        row: name that the rows begin with.
+        report: receives the rows.
+        row: prefix of the row ids.
         found: answers.
         bars: whether the bars of the drives apply.
     """
@@ -96,14 +109,14 @@ def status_rows(
     *,
     bars: tuple[float | None, float | None, float | None],
 ) -> None:
-    """Shares of all queries with the status applied, and forced.
+    """Add shares of all queries by status, and forced.
 
     Args:
-        report: where to.
-        row: name that the rows begin with.
-        errors_m: of the best guess of each query; infinite where there is none.
-        localized: whether each is accepted.
-        bars: for accepted and within 1 m, accepted and wrong, and the median of accepted errors.
+        report: receives the rows.
+        row: prefix of the row ids.
+        errors_m: position error of the best hypothesis of each query (n,), metres; infinite without a hypothesis.
+        localized: whether the answer is accepted (n,).
+        bars: limits of three figures: accepted and within 1 m, accepted and wrong, median error of accepted answers.
     """
     answered_bar, wrong_bar, median_bar = bars
     report.share(f"{row}.answered", localized)
@@ -111,16 +124,30 @@ def status_rows(
     report.share(f"{row}.answered_wrong", localized & (errors_m > RIGHT_M), bar=wrong_bar, better="lower")
     accepted = errors_m[localized]
     report.row(
-        f"{row}.median_m", float(np.median(accepted)) if len(accepted) else None, "m", bar=median_bar, better="lower",
-        n=len(accepted), why=None if len(accepted) else "no answer was accepted",
-    )  # fmt: skip
+        f"{row}.median_m",
+        float(np.median(accepted)) if len(accepted) else None,
+        "m",
+        bar=median_bar,
+        better="lower",
+        n=len(accepted),
+        why=None if len(accepted) else "no answer was accepted",
+    )
     report.share(f"{row}.forced_within_1_m", errors_m <= RIGHT_M)
     finite = errors_m[np.isfinite(errors_m)]
     report.row(f"{row}.forced_median_m", float(np.median(finite)) if len(finite) else None, "m", n=len(finite))
 
 
 def imported(data: Path, work: Path, name: str) -> Dataset | None:
-    """The drive as a user imports it, made anew; None where the recording is not there."""
+    """Import a drive with default settings; return None if the recording is absent.
+
+    Args:
+        data: folder of the recordings.
+        work: folder of datasets.
+        name: name of the drive.
+
+    Raises:
+        FileNotFoundError: the recording has no poses.
+    """
     if not (data / name).exists():
         return None
     raw, folder = work / f"{name}_raw", work / f"{name}_data"
@@ -138,7 +165,7 @@ def imported(data: Path, work: Path, name: str) -> Dataset | None:
 
 
 def _street(report: Report, data: Path, work: Path, name: str) -> Street | None:
-    """The drive's map, made anew; None where the recording is not there, which the report then says."""
+    """Import a drive and build its map; return None and add a row without a value if the recording is absent."""
     dataset = imported(data, work, name)
     if dataset is None:
         report.row(
@@ -152,7 +179,7 @@ def _street(report: Report, data: Path, work: Path, name: str) -> Street | None:
 
 
 def _stage_rows(report: Report, street: Street) -> None:
-    """Retrieval before any place was verified, and what share of the depth fits the map at the true pose."""
+    """Add the recall of retrieval without registration, and the share of inliers at the true pose."""
     found = stages_of(street.localizer, street.dataset, QUERIES)
     at_truth = [each.inliers_at_truth for each in found if np.isfinite(each.inliers_at_truth)]
     from_truth = [each.inliers_from_truth for each in found if np.isfinite(each.inliers_from_truth)]
@@ -163,11 +190,11 @@ def _stage_rows(report: Report, street: Street) -> None:
 
 
 def sequence_rows(report: Report, name: str, dataset: Dataset, localizer: Localizer, *, bars: bool = True) -> None:
-    """Add rows of all sequences of five consecutive pairs; each is one query with the recording's relative poses.
+    """Add the rows of sequences of five consecutive pairs. Each sequence is one query with the relative poses of the recording.
 
     Args:
-        report: where to.
-        name: name of the drive, part of the rows' ids.
+        report: receives the rows.
+        name: name of the drive, part of the row ids.
         dataset: the dataset of the drive.
         localizer: localizer of its map.
         bars: whether the bar of the drives applies.

@@ -1,4 +1,4 @@
-"""``real.kitti_0005.*`` in other conditions: sparser surveys, grey images, a prior, five frames. The drive that may be tuned on."""
+"""Rows ``real.kitti_0005.*`` in other conditions: sparser surveys, grey images, a prior, five frames. Settings may be chosen on it."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -24,7 +24,7 @@ from service.retrieval.query import Query
 DRIVE = "kitti_0005"
 #: Standard deviation of the prior's error, metres.
 PRIOR_M = 3.0
-#: A scan is taken every so many. The drive has one every 2.7 m.
+#: Intervals of the scans of sparse surveys. The drive has one scan every 2.7 m.
 SPARSE = (2, 3)
 
 
@@ -78,7 +78,7 @@ def variant_rows(report: Report, data: Path, work: Path) -> None:
     """Measure the drive in each condition, at default settings.
 
     Args:
-        report: where to.
+        report: receives the rows.
         data: folder of the recordings.
         work: folder of datasets and maps.
     """

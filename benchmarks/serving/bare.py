@@ -67,13 +67,19 @@ def ask(localizer: Localizer, frame: QueryFrame, rgb: bytes, depth: bytes, *, re
     camera, spec = frame.camera.pinhole(), frame.camera.depth
     localizer.localize(
         Query(
-            rgb=decode_rgb(rgb), camera=camera, refine=refine,
+            rgb=decode_rgb(rgb),
+            camera=camera,
+            refine=refine,
             depth_m=decode_depth(
-                depth, camera=camera, scale_m=spec.scale_m, kind=spec.kind, baseline_m=spec.baseline_m,
+                depth,
+                camera=camera,
+                scale_m=spec.scale_m,
+                kind=spec.kind,
+                baseline_m=spec.baseline_m,
                 max_range_m=spec.max_range_m,
             ),
         )
-    )  # fmt: skip
+    )
 
 
 def _values(frame: QueryFrame) -> NDArray[Any]:

@@ -56,8 +56,15 @@ def overload_rows(report: Report, site: Site, *, seconds: float, rounds: int, co
     report.row("overload.offered_per_s", median(found.offered_per_s for found in founds), "1/s", n=rounds)
     report.row("overload.goodput_over_peak", median(good), "ratio", bar=0.95, n=rounds)
     report.notes["overload"] = f"Goodput over peak of each round: {told}."
-    report.row("overload.refusal_p99_ms", median(refused) if refused else None, "ms", bar=50, better="lower", n=rounds,
-               why=f"{failed} failed instead of a refusal" if failed else None)  # fmt: skip
+    report.row(
+        "overload.refusal_p99_ms",
+        median(refused) if refused else None,
+        "ms",
+        bar=50,
+        better="lower",
+        n=rounds,
+        why=f"{failed} failed instead of a refusal" if failed else None,
+    )
     report.row("overload.generator_late_p99_ms", median(found.late_ms["p99"] for found in founds), "ms", n=rounds)
     report.row("overload.health_p99_ms", median(health_ms), "ms", bar=50, better="lower", n=rounds)
 
@@ -111,8 +118,15 @@ def swap_rows(report: Report, site: Site, *, core: int | None) -> None:
                 shutil.rmtree(oldest)
     versions = set(answers)
     report.row("swap.versions_that_answered", len(versions), "count")
-    report.row("swap.failed_requests", len(failed), "count", bar=0, better="lower", n=len(answers) + len(failed),
-               why=f"first: {failed[0]}" if failed else None)  # fmt: skip
+    report.row(
+        "swap.failed_requests",
+        len(failed),
+        "count",
+        bar=0,
+        better="lower",
+        n=len(answers) + len(failed),
+        why=f"first: {failed[0]}" if failed else None,
+    )
 
 
 def _version_of(bundle: Path, folder: Path, number: int) -> tuple[Path, str]:
@@ -186,6 +200,13 @@ def sigterm_rows(report: Report, site: Site, *, core: int | None) -> None:
                 while watcher.get("/readyz").status_code == 200:
                     time.sleep(0.05)
         code = server.process.wait(60)
-    report.row("sigterm.failed_requests", len(failed), "count", bar=0, better="lower", n=len(answers) + len(failed),
-               why=f"first: {failed[0]}" if failed else None)  # fmt: skip
+    report.row(
+        "sigterm.failed_requests",
+        len(failed),
+        "count",
+        bar=0,
+        better="lower",
+        n=len(answers) + len(failed),
+        why=f"first: {failed[0]}" if failed else None,
+    )
     report.row("sigterm.exit_code", code, "count", bar=0, better="lower")

@@ -54,8 +54,10 @@ def guard() -> Iterator[Guard]:
         keys = folder / "keys.txt"
         keys.write_text(f"robot {hash_of(key)}\noperator {hash_of(operator_key)} operator\n")
         settings: dict[str, object] = {
-            "api_keys": keys, "tls_certificate": folder / "certificate.pem", "tls_key": folder / "key.pem",
-        }  # fmt: skip
+            "api_keys": keys,
+            "tls_certificate": folder / "certificate.pem",
+            "tls_key": folder / "key.pem",
+        }
         yield Guard(settings, authority.cert_pem.bytes(), key, operator_key)
 
 

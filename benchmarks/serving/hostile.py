@@ -63,8 +63,15 @@ def hostile_rows(report: Report, site: Site, *, core: int | None) -> None:
     report.notes["hostile"] = {name: sorted(each) for name, each in sorted(told.items())}
     report.row("hostile.kinds", len(kinds), "count")
     report.row("hostile.peak_mib", peak[0] - idle, "MiB", bar=200, better="lower", n=len(kinds))
-    report.row("hostile.healthy_requests_failed", len(failed) + (not lives), "count", bar=0, better="lower", n=len(answers) + len(failed),
-               why=f"first: {failed[0]}" if failed else None)  # fmt: skip
+    report.row(
+        "hostile.healthy_requests_failed",
+        len(failed) + (not lives),
+        "count",
+        bar=0,
+        better="lower",
+        n=len(answers) + len(failed),
+        why=f"first: {failed[0]}" if failed else None,
+    )
 
 
 def hostile_kinds(good: dict[str, bytes]) -> dict[str, Callable[[str], str]]:

@@ -30,10 +30,14 @@ def call(address: str, path: str, message: memoryview, *, timeout_s: float) -> s
             headers = b"".join(
                 _literal(name, value)
                 for name, value in (
-                    (b":method", b"POST"), (b":scheme", b"http"), (b":path", path.encode()), (b":authority", b"localhost"),
-                    (b"te", b"trailers"), (b"content-type", b"application/grpc"),
+                    (b":method", b"POST"),
+                    (b":scheme", b"http"),
+                    (b":path", path.encode()),
+                    (b":authority", b"localhost"),
+                    (b"te", b"trailers"),
+                    (b"content-type", b"application/grpc"),
                 )
-            )  # fmt: skip
+            )
             connection.sendall(_PREFACE + _frame(_SETTINGS, 0, 0, b"") + _frame(_HEADERS, _END_HEADERS, 1, headers))
             windows = {0: 65_535, 1: 65_535}
             body = [memoryview(b"\x00" + struct.pack(">I", len(message))), message]

@@ -64,11 +64,15 @@ def launch(
     if temporary is not None:
         environment["TMPDIR"] = str(temporary)
     return subprocess.Popen(
-        [*_SERVE, str(maps), "--port", str(port), "--grpc-port", str(grpc_port)], cwd=ROOT, env=environment,
-        stdout=subprocess.PIPE, stderr=stderr, text=True,
+        [*_SERVE, str(maps), "--port", str(port), "--grpc-port", str(grpc_port)],
+        cwd=ROOT,
+        env=environment,
+        stdout=subprocess.PIPE,
+        stderr=stderr,
+        text=True,
         process_group=0,  # Ctrl-C ends the measurement, which then ends the service
         preexec_fn=enter,  # the load generator has not started its threads yet
-    )  # fmt: skip
+    )
 
 
 class Server:

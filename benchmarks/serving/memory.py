@@ -76,10 +76,24 @@ def memory_rows(report: Report, site: Site) -> None:
     report.row("memory.healthy_answered", len(answers), "count", n=len(answers) + len(refused))
     broken = len(refused) - len(busy)
     first = next((each for each in refused if each not in busy), None)
-    report.row("memory.healthy_neither_answered_nor_refused", broken, "count", bar=0, better="lower", n=len(answers) + len(refused),
-               why=f"first: {first}" if first else None)  # fmt: skip
-    report.row("memory.failed_afterwards", sum(each != "200" for each in afterwards), "count", bar=0, better="lower", n=AFTERWARDS,
-               why=None if set(afterwards) == {"200"} else f"answers: {Counter(afterwards)}")  # fmt: skip
+    report.row(
+        "memory.healthy_neither_answered_nor_refused",
+        broken,
+        "count",
+        bar=0,
+        better="lower",
+        n=len(answers) + len(refused),
+        why=f"first: {first}" if first else None,
+    )
+    report.row(
+        "memory.failed_afterwards",
+        sum(each != "200" for each in afterwards),
+        "count",
+        bar=0,
+        better="lower",
+        n=AFTERWARDS,
+        why=None if set(afterwards) == {"200"} else f"answers: {Counter(afterwards)}",
+    )
 
 
 def _until_over(attackers: list[tuple[str, Callable[[], str]]], ends: dict[str, Counter[str]]) -> None:

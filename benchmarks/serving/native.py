@@ -39,9 +39,13 @@ def native_rows(report: Report, work: Path) -> None:
             if instructions:
                 print(f"{name}: {dict(instructions.most_common(10))}")
         report.row(
-            "native.instructions_beyond_baseline", sum(each.total() for each in found.values()), "instructions", bar=0,
-            better="lower", n=len(found),
-        )  # fmt: skip
+            "native.instructions_beyond_baseline",
+            sum(each.total() for each in found.values()),
+            "instructions",
+            bar=0,
+            better="lower",
+            n=len(found),
+        )
         report.notes["native"] = (
             f"A wheel built by zig on {platform.machine()}, PATH empty; {len(found)} libraries disassembled. Answers to {QUERIES} "
             "stereo queries of a small city, by that wheel and by one built with gcc, compared bit by bit."

@@ -188,7 +188,11 @@ class Traffic:
 
     def _single(self, number: int) -> tuple[str, Payload]:
         which = number % len(self._singles)
-        return (f"retrieval {which}", self._retrieval[which]) if number % 8 == 0 else (f"full {which}", self._singles[which])  # fmt: skip
+        return (
+            (f"retrieval {which}", self._retrieval[which])
+            if number % 8 == 0
+            else (f"full {which}", self._singles[which])
+        )
 
     async def _queue_frame(self, number: int) -> None:
         try:
@@ -349,9 +353,14 @@ class Traffic:
         return found
 
     _kinds: dict[str, Callable[["Traffic", int], Awaitable[None]]] = {  # noqa: RUF012  # never changed
-        "rest": rest, "grpc": _grpc, "stream": _queue_frame, "sequence": _sequence, "batch": _batch,
-        "refused": _refused, "listing": _listing,
-    }  # fmt: skip
+        "rest": rest,
+        "grpc": _grpc,
+        "stream": _queue_frame,
+        "sequence": _sequence,
+        "batch": _batch,
+        "refused": _refused,
+        "listing": _listing,
+    }
 
 
 def soak_rows(report: Report, site: Site, *, minutes: float, rate: float | None, core: int | None) -> None:
@@ -534,14 +543,24 @@ def _write(report: Report, samples: list[Sample], tally: Tally, *, aimed: float,
         report.row("soak.threads", samples[-1].held.threads, "count")
     report.row("soak.minutes", lasted, "min")
     report.row("soak.requests", sent, "count")
-    report.row("soak.failed_requests", sum(tally.failed.values()), "count", bar=0, better="lower", n=sent,
-               why=f"first: {tally.told[0]}" if tally.told else None)  # fmt: skip
+    report.row(
+        "soak.failed_requests",
+        sum(tally.failed.values()),
+        "count",
+        bar=0,
+        better="lower",
+        n=sent,
+        why=f"first: {tally.told[0]}" if tally.told else None,
+    )
     report.row("soak.answers_that_differ", tally.differ, "count", bar=0, better="lower", n=sent)
     report.row("soak.spans", tally.spans, "count")
     report.notes["soak"] = {
-        "pairs_per_s": round(aimed, 2), "capacity_per_s": None if capacity is None else round(capacity, 2),
-        "sent": dict(tally.sent), "failed": dict(tally.failed), "first_failed": tally.told,
-    }  # fmt: skip
+        "pairs_per_s": round(aimed, 2),
+        "capacity_per_s": None if capacity is None else round(capacity, 2),
+        "sent": dict(tally.sent),
+        "failed": dict(tally.failed),
+        "first_failed": tally.told,
+    }
     folder = report.folder / "serving"
     folder.mkdir(parents=True, exist_ok=True)
     _write_series(samples, folder / "soak.csv")
@@ -560,8 +579,18 @@ def _write_series(samples: list[Sample], path: Path) -> None:
     with part.open("w", newline="") as file:
         writer = csv.writer(file, lineterminator="\n")
         writer.writerow(
-            ["at_s", "anonymous_mib", "private_dirty_mib", "resident_mib", "descriptors", "threads", "sent", "failed", "spans"]
-        )  # fmt: skip
+            [
+                "at_s",
+                "anonymous_mib",
+                "private_dirty_mib",
+                "resident_mib",
+                "descriptors",
+                "threads",
+                "sent",
+                "failed",
+                "spans",
+            ]
+        )
         for each in samples:
             now = each.held
             memory = (f"{mib:.2f}" for mib in (now.anonymous_mib, now.private_dirty_mib, now.resident_mib))

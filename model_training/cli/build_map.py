@@ -7,7 +7,7 @@ import typer
 from rich.console import Console
 
 from model_training.cli.progress import bars
-from model_training.datasets.dataset import Dataset
+from model_training.datasets.dataset import MOST_SURVEY_STD_DEG, MOST_SURVEY_STD_M, Dataset
 from model_training.mapping.build import build_map, describe
 from model_training.mapping.settings import BuildSettings
 from model_training.stock import CALIBRATION, ENCODER
@@ -64,6 +64,25 @@ def command(
             help="Align the survey's scans first. Survey poses are off by centimetres, and the scans show by how much."
         ),
     ] = True,
+    survey_std_m: Annotated[
+        float | None,
+        typer.Option(
+            help="Standard deviation of the survey's positions per axis, metres. It widens the covariance of answers.  "
+            "[default: what the dataset states]",
+            min=0,
+            max=MOST_SURVEY_STD_M,
+            show_default=False,
+        ),
+    ] = None,
+    survey_std_deg: Annotated[
+        float | None,
+        typer.Option(
+            help="Standard deviation of the survey's angles, degrees.  [default: what the dataset states]",
+            min=0,
+            max=MOST_SURVEY_STD_DEG,
+            show_default=False,
+        ),
+    ] = None,
     licence: Annotated[str, typer.Option(help="Licence text for the manifest.")] = "",
     calibration: Annotated[
         Path,
@@ -84,11 +103,21 @@ def command(
     """
     opened = Dataset(dataset)
     settings = BuildSettings(
-        name=name or opened.name, spacing_m=spacing, between_m=between, headings=headings, voxel_m=voxel,
+        name=name or opened.name,
+        spacing_m=spacing,
+        between_m=between,
+        headings=headings,
+        voxel_m=voxel,
         expected_lidar_height_m=lidar_height,
-        remove_weather=remove_weather, passes_vote=passes_vote, traffic_vote=traffic_vote, licence=licence, calibration=calibration,
+        remove_weather=remove_weather,
+        passes_vote=passes_vote,
+        traffic_vote=traffic_vote,
+        licence=licence,
+        calibration=calibration,
         align_survey=align_survey,
-    )  # fmt: skip
+        survey_std_m=survey_std_m,
+        survey_std_deg=survey_std_deg,
+    )
     with bars() as report:
         manifest = build_map(opened, encoder, out, settings, overwrite=overwrite, report=report)
     Console().print(f"{describe(manifest)}: {out}")

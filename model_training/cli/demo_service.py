@@ -58,8 +58,11 @@ def serving(bundle: Path, port: int, samples: Path | None = None) -> Iterator[Ru
     # A group of its own: Ctrl-C in a terminal reaches this process alone, which then ends the service in good order.
     process = subprocess.Popen(  # noqa: S603  # this interpreter, our own command
         [*_COMMAND, str(bundle), "--host", "127.0.0.1", "--port", str(port), *given],
-        stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, text=True, process_group=0,
-    )  # fmt: skip
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.PIPE,
+        text=True,
+        process_group=0,
+    )
     try:
         with _endings_as_ctrl_c():
             url = _address(process)

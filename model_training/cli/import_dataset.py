@@ -131,15 +131,24 @@ def command(
     if sync not in ("interpolate", "nearest"):
         raise DatasetError(f"sync: {sync!r} is not valid; choose interpolate or nearest", field="sync")
     settings = TakeSettings(
-        queries=queries if pictures else "", depth="lidar" if depth == "lidar" else "recorded", sync=cast(Sync, sync),
-        tolerance_s=tolerance, deskew=deskew, hold_out=hold_out, hold_out_first=hold_out_first,
-    )  # fmt: skip
+        queries=queries if pictures else "",
+        depth="lidar" if depth == "lidar" else "recorded",
+        sync=cast(Sync, sync),
+        tolerance_s=tolerance,
+        deskew=deskew,
+        hold_out=hold_out,
+        hold_out_first=hold_out_first,
+    )
     told = OpenSettings(
-        depth=cast(DepthFrom, depth or "recorded"), topics=_topics(topic or []), rectified=rectified,
+        depth=cast(DepthFrom, depth or "recorded"),
+        topics=_topics(topic or []),
+        rectified=rectified,
         camera=None if camera is None else read_camera(camera),
-        extrinsics=None if extrinsics is None else read_extrinsics(extrinsics), poses=poses, pictures=pictures,
+        extrinsics=None if extrinsics is None else read_extrinsics(extrinsics),
+        poses=poses,
+        pictures=pictures,
         vertical_correction=vertical_correction,
-    )  # fmt: skip
+    )
     if odometry and poses is not None:
         raise DatasetError(
             "poses: --odometry finds the poses, so --poses has no effect; give one of the two", field="poses"

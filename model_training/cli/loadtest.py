@@ -179,11 +179,12 @@ def table_of(found: list[Summary]) -> Table:
         ms = each.answered_ms
         table.add_row(
             f"{each.rate:g}/s" if each.rate is not None else f"{each.concurrency} clients",
-            f"{each.answered_per_s:.1f}", *(f"{ms[name]:.1f}" if ms else "-" for name in ("p50", "p90", "p99")),
+            f"{each.answered_per_s:.1f}",
+            *(f"{ms[name]:.1f}" if ms else "-" for name in ("p50", "p90", "p99")),
             ", ".join(f"{count} x {code}" for code, count in sorted(each.errors.items())) or "none",
             "-" if each.right is None else f"{each.right:.1%}",
             *((f"{each.cpu_ms_per_answer:.1f}",) if each.cpu_ms_per_answer is not None else ()),
-        )  # fmt: skip
+        )
     if wrong := sum(each.inconsistent for each in found):
         table.caption = f"{table.caption}; {wrong} answers differ from another answer to the same request"
     if (late_ms := max(each.late_ms.get("p99", 0.0) for each in found)) > LATE_MS:

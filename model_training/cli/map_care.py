@@ -16,6 +16,7 @@ from model_training.mapping.merge import merge_maps
 from model_training.mapping.update import update_map
 from model_training.mapping.verify import damage_of
 from service.errors import BundleError
+from service.maps.calibration import RigCorrection
 from service.maps.reader import MapBundle
 
 app = typer.Typer(
@@ -113,9 +114,15 @@ def merge(
     Example:
       streetfix map merge maps/north maps/south --out maps/town
     """
+    rigs = [_rig_of(each) for each in (first, second)]
     with bars() as report:
         made = merge_maps(first, second, out, name=name, overwrite=overwrite, report=report)
     Console().print(f"{describe(made)}: {out}")
+    if rigs[0] != rigs[1]:
+        Console(soft_wrap=True).print(
+            f"confidence: the two maps have different corrections for a rig, so the new map has none; run "
+            f"`streetfix calibrate --map {out} --drive DATASET`"
+        )
 
 
 @app.command()
@@ -150,10 +157,21 @@ def update(
     require_map_first(bundle, dataset, "map update")
     with bars() as report:
         made = update_map(
-            bundle, Dataset(dataset), out, replace_covered=replace, replace_area=replace_area, passes_vote=passes_vote,
-            overwrite=overwrite, report=report,
-        )  # fmt: skip
+            bundle,
+            Dataset(dataset),
+            out,
+            replace_covered=replace,
+            replace_area=replace_area,
+            passes_vote=passes_vote,
+            overwrite=overwrite,
+            report=report,
+        )
     Console().print(f"{describe(made)}: {out}")
+
+
+def _rig_of(bundle: Path) -> RigCorrection | None:
+    calibration = MapBundle.open(bundle, verify=False).calibration
+    return None if calibration is None else calibration.rig
 
 
 def _info_lines(found: dict[str, Any]) -> list[str]:
@@ -161,6 +179,8 @@ def _info_lines(found: dict[str, Any]) -> list[str]:
     place = found["georeference"]
     site = found["site"]
     checked = "" if site is None else f", {site['right']} of {site['queries']} right in the site check"
+    rig = found["rig"]
+    checked += "" if rig is None else f", corrected for a rig by {rig['frames']} frames ({rig['measured_on']})"
     return [
         f"map {found['name']}, version {found['version']}, made {found['made_at']}, {found['size_bytes'] / 1e6:.1f} MB",
         f"places:      {counts['places']}, {found['spacing_m']:g} m apart, x {low[0]:g} to {high[0]:g} m, y {low[1]:g} to {high[1]:g} m",

@@ -37,7 +37,10 @@ def print_queries(name: str, answers: Predictions, console: Console, *, most: in
     for row in rows:
         confidence = answers.confidence[row]
         table.add_row(
-            str(row), str(answers.status[row]) or "refused", f"{confidence:.3f}" if math.isfinite(confidence) else "-",
-            f"{errors[row]:.2f} m" if math.isfinite(errors[row]) else "-", f"{turned[row]:.0f}°" if math.isfinite(turned[row]) else "-",
-        )  # fmt: skip
+            str(row),
+            str(answers.status[row]) or "refused",
+            f"{confidence:.3f}" if math.isfinite(confidence) else "-",
+            f"{errors[row]:.2f} m" if math.isfinite(errors[row]) else "-",
+            f"{turned[row]:.0f}°" if math.isfinite(turned[row]) else "-",
+        )
     console.print(table)

@@ -183,12 +183,20 @@ def command(
         raise DatasetError("size: the paper's city has a fixed size; omit --size, or use --city city", field="size")
     width, height = _pair(camera, "camera", least=48, most=4096)
     plan = SimulationPlan(
-        name=name or out.name, city=cast(Literal["paper", "city", "mixed"], city), seed=seed,
+        name=name or out.name,
+        city=cast(Literal["paper", "city", "mixed"], city),
+        seed=seed,
         size_m=_pair(size or "300x400", "size", least=30, most=10_000),
-        streets=tuple(s for s in streets.split(",") if s), lidar=lidar, spacing_m=spacing, survey_condition=survey_condition,
-        survey_error=survey_error, camera=CameraPlan.model_validate({"width": width, "height": height, "horizontal_deg": hfov}),
-        queries=tuple(plans), lidar_parameters=lidar_parameters, survey_parameters=survey_parameters,
-    )  # fmt: skip
+        streets=tuple(s for s in streets.split(",") if s),
+        lidar=lidar,
+        spacing_m=spacing,
+        survey_condition=survey_condition,
+        survey_error=survey_error,
+        camera=CameraPlan.model_validate({"width": width, "height": height, "horizontal_deg": hfov}),
+        queries=tuple(plans),
+        lidar_parameters=lidar_parameters,
+        survey_parameters=survey_parameters,
+    )
     with bars() as report:
         simulate(plan, out, workers=workers, report=report)
     Console().print(f"dataset {plan.name}: {out}")

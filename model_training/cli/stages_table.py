@@ -38,12 +38,18 @@ def print_stages(name: str, found: list[QueryStages], console: Console) -> None:
 
 def _row(each: QueryStages) -> tuple[str, ...]:
     return (
-        str(each.number), _number(each.tilt_deg, "{:.1f}°"), _number(each.height_error_m, "{:+.2f} m"),
-        str(each.rank or "-"), *(_number(x, "{:.2f} m") for x in (each.start_m, each.candidate_m, each.from_truth_m)),
+        str(each.number),
+        _number(each.tilt_deg, "{:.1f}°"),
+        _number(each.height_error_m, "{:+.2f} m"),
+        str(each.rank or "-"),
+        *(_number(x, "{:.2f} m") for x in (each.start_m, each.candidate_m, each.from_truth_m)),
         f"{_number(each.inliers_at_truth, '{:.2f}')} > {_number(each.inliers_from_truth, '{:.2f}')}",
-        _number(each.error_m, "{:.2f} m"), _number(each.heading_error_deg, "{:.0f}°"), each.status or "refused",
-        _number(each.confidence, "{:.3f}"), str(each.lost),
-    )  # fmt: skip
+        _number(each.error_m, "{:.2f} m"),
+        _number(each.heading_error_deg, "{:.0f}°"),
+        each.status or "refused",
+        _number(each.confidence, "{:.3f}"),
+        str(each.lost),
+    )
 
 
 def _number(value: float, form: str) -> str:

@@ -41,10 +41,16 @@ from service.retrieval.query import DepthFormat, Query, decoded_query
 
 #: Version of the folder's format.
 FORMAT = 1
+#: File of a query set with the poses of the camera by odometry, TUM format, a line per image.
+ODOMETRY_FILE = "odometry.txt"
 #: Homogeneous transforms (n, 4, 4), metres.
 Transforms = NDArray[np.float64]
 #: File endings of colour images.
 PICTURES = (".jpg", ".jpeg", ".png", ".webp")
+
+
+#: Upper limits of ``SurveyAccuracy``.
+MOST_SURVEY_STD_M, MOST_SURVEY_STD_DEG = 5.0, 5.0
 
 
 class _Model(BaseModel):
@@ -151,6 +157,18 @@ class Sensors(_Model):
     cameras: list[CameraSensor] = []
 
 
+class SurveyAccuracy(_Model):
+    """Accuracy of the survey's poses against the Earth or the world of a simulation.
+
+    Attributes:
+        position_std_m: standard deviation of the position per axis, metres.
+        angle_std_deg: standard deviation of each angle, degrees.
+    """
+
+    position_std_m: float = Field(ge=0, le=MOST_SURVEY_STD_M)
+    angle_std_deg: float = Field(ge=0, le=MOST_SURVEY_STD_DEG)
+
+
 class DatasetDescription(_Model):
     """Content of ``dataset.json``.
 
@@ -162,6 +180,7 @@ class DatasetDescription(_Model):
         georeference: position of the map frame on the Earth; None: unknown.
         conditions: weather and light of the survey and the queries.
         seed: seed of a simulation; None: not simulated.
+        survey_accuracy: accuracy of the survey's poses; None: unknown.
     """
 
     format: int = FORMAT
@@ -171,6 +190,13 @@ class DatasetDescription(_Model):
     georeference: dict[str, Any] | None = None
     conditions: dict[str, Any] = {}
     seed: int | None = None
+    survey_accuracy: SurveyAccuracy | None = None
+
+    @model_serializer(mode="wrap")
+    def _without_unknown_accuracy(self, serialize: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        """Leave an unknown accuracy out, so that a release that does not know the field can read the dataset."""
+        content: dict[str, Any] = serialize(self)
+        return {name: value for name, value in content.items() if value is not None or name != "survey_accuracy"}
 
 
 @dataclass(frozen=True, slots=True)
@@ -212,9 +238,15 @@ class QueryFrame:
         spec, data = self.camera.depth, read_bytes(self.depth_path)
         with _decoding(self.depth_path):
             return decode_depth(
-                data, encoding=None, scale_m=spec.scale_m, kind=spec.kind, camera=self.camera.pinhole(),
-                baseline_m=spec.baseline_m, max_range_m=spec.max_range_m, limits=ImageLimits(),
-            )  # fmt: skip
+                data,
+                encoding=None,
+                scale_m=spec.scale_m,
+                kind=spec.kind,
+                camera=self.camera.pinhole(),
+                baseline_m=spec.baseline_m,
+                max_range_m=spec.max_range_m,
+                limits=ImageLimits(),
+            )
 
     def query(self, grid: ViewGrid) -> Query:
         """Return the query that the service makes of these images, with default options.
@@ -358,6 +390,20 @@ class Dataset:
             names = sorted(p.name for p in root.iterdir() if (p / "rgb").is_dir()) if root.is_dir() else []
         return [n for n in names if not with_truth or (root / n / "poses.txt").exists()]
 
+    def odometry(self, name: str) -> Transforms | None:
+        """Return T_odom_camera of every image of a query set (n, 4, 4), metres; None if the set has no odometry.
+
+        The frame ``odom`` is fixed, and the poses drift in it. ``streetfix calibrate --drive`` labels answers with them.
+
+        Args:
+            name: name of the query set.
+
+        Raises:
+            DatasetError: the file is damaged.
+        """
+        path = query_folder(self.folder, name) / ODOMETRY_FILE
+        return read_tum(path)[1] if path.exists() else None
+
     def queries(self, name: str) -> Iterator[QueryFrame]:
         """Yield the frames of a query set, one at a time.
 
@@ -393,9 +439,13 @@ class Dataset:
                     f"{folder}/cameras.txt names {camera_name!r}, which is not in dataset.json", field="cameras.txt"
                 )
             yield QueryFrame(
-                number, rgb_path, depth_path, cameras[camera_name],
-                T_map_camera=None if truth is None else truth[number], stamp_s=None if stamps is None else float(stamps[number]),
-            )  # fmt: skip
+                number,
+                rgb_path,
+                depth_path,
+                cameras[camera_name],
+                T_map_camera=None if truth is None else truth[number],
+                stamp_s=None if stamps is None else float(stamps[number]),
+            )
 
 
 @contextmanager

@@ -97,8 +97,9 @@ def read_rows(path: Path, size: int) -> Float32[NDArray[np.float32], "N 4"]:
     if len(values) != size // 4:
         raise DatasetError(
             f"{path}: the file changed while it was read (from {size} to {4 * len(values)} bytes); "
-            "do not change the folder meanwhile, and start again", field=path.name,
-        )  # fmt: skip
+            "do not change the folder meanwhile, and start again",
+            field=path.name,
+        )
     return values.reshape(-1, 4)
 
 

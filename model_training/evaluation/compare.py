@@ -74,8 +74,9 @@ class Comparison:
             "shares": {name: asdict(each) | {"difference": each.difference} for name, each in self.shares.items()},
             "sets": {name: asdict(each) | {"difference": each.difference} for name, each in self.sets.items()},
             "errors": None if self.errors is None else asdict(self.errors),
-            "gained": self.gained, "lost": self.lost,
-        }  # fmt: skip
+            "gained": self.gained,
+            "lost": self.lost,
+        }
 
 
 def _surely_more(each: PairedShares) -> bool:
@@ -121,9 +122,11 @@ def compare(first: SavedRun, second: SavedRun) -> Comparison:
         shares={name: paired_shares(one, other) for name, one, other in _flags(a, b)},
         sets={name: paired_shares(_right(first.predictions[name]), _right(second.predictions[name])) for name in names},
         errors=paired_errors(position_errors(a), position_errors(b)),
-        gained=[int(k) for k in np.flatnonzero(right_b & ~right_a)], lost=[int(k) for k in np.flatnonzero(right_a & ~right_b)],
-        first=a, second=b,
-    )  # fmt: skip
+        gained=[int(k) for k in np.flatnonzero(right_b & ~right_a)],
+        lost=[int(k) for k in np.flatnonzero(right_a & ~right_b)],
+        first=a,
+        second=b,
+    )
 
 
 def _right(p: Predictions) -> NDArray[np.bool_]:
@@ -148,8 +151,9 @@ def _require_same_queries(first: SavedRun, second: SavedRun) -> None:
         alone = ", ".join(sorted(names ^ others))
         raise DatasetError(
             f"{first.folder} and {second.folder} have different query sets: only one has {alone}; "
-            "evaluate both with the same --queries", field="queries",
-        )  # fmt: skip
+            "evaluate both with the same --queries",
+            field="queries",
+        )
     for name in sorted(names):
         one, other = first.predictions[name].T_true, second.predictions[name].T_true
         if len(one) != len(other) or not np.allclose(one, other, rtol=0, atol=SAME_M):
@@ -158,4 +162,4 @@ def _require_same_queries(first: SavedRun, second: SavedRun) -> None:
                 f"{second.folder} ({second.settings.dataset.name}, {len(other)} queries) have different queries; "
                 "evaluate both on the same dataset",
                 field="queries",
-            )  # fmt: skip
+            )

@@ -148,10 +148,13 @@ def disparity_errors(dataset: Dataset, query_set: str) -> DisparityErrors:
         row, column = np.nonzero(counted)
         found.append(
             DisparityErrors(
-                (measured - ahead[counted]).astype(float), (gradient_of(frame.rgb()) >= TEXTURED)[counted],
-                focal_baseline / ahead[counted].astype(float), row, column,
+                (measured - ahead[counted]).astype(float),
+                (gradient_of(frame.rgb()) >= TEXTURED)[counted],
+                focal_baseline / ahead[counted].astype(float),
+                row,
+                column,
             )
-        )  # fmt: skip
+        )
     if not found:
         raise ValueError(f"{dataset.folder}: no query of {query_set!r} lies between two scans")
     return DisparityErrors.joined(found)

@@ -73,10 +73,12 @@ def evaluate(
     }
     splits = sorted({str(s["split"]) for s in sets.values()})
     head = {
-        "map": {"name": bundle.name, "version": bundle.manifest.version}, "dataset": dataset.name,
-        "split": splits[0] if len(splits) == 1 else "mixed", "encoder_sha256": bundle.manifest.encoder_sha256,
+        "map": {"name": bundle.name, "version": bundle.manifest.version},
+        "dataset": dataset.name,
+        "split": splits[0] if len(splits) == 1 else "mixed",
+        "encoder_sha256": bundle.manifest.encoder_sha256,
         "registered": refine and bundle.cloud is not None,
-    }  # fmt: skip
+    }
     return Evaluation(head | figures | {"sets": sets}, predictions)
 
 

@@ -60,9 +60,11 @@ def stages(predictions: Predictions) -> list[Stage]:
     off = np.linalg.norm(predictions.candidates[..., :2] - true_xy[:, None], axis=2)
     candidate_near = (np.nan_to_num(off, nan=np.inf) <= RIGHT_PLACE_M).any(axis=1)
     return [
-        _stage(errors[k], bool(predictions.localized[k]), bool(among_ten[k]), bool(registered[k]), bool(candidate_near[k]))
+        _stage(
+            errors[k], bool(predictions.localized[k]), bool(among_ten[k]), bool(registered[k]), bool(candidate_near[k])
+        )
         for k in range(len(errors))
-    ]  # fmt: skip
+    ]
 
 
 def _stage(error_m: float, accepted: bool, among_ten: bool, registered: bool, candidate_near: bool) -> Stage:

@@ -54,9 +54,14 @@ def paired_shares(first: NDArray[np.bool_], second: NDArray[np.bool_]) -> Paired
     both, only_first = int((first & second).sum()), int((first & ~second).sum())
     only_second, neither = int((~first & second).sum()), int((~first & ~second).sum())
     return PairedShares(
-        float(np.mean(first)), float(np.mean(second)), only_first, only_second,
-        _newcombe(both, only_second, only_first, neither), mcnemar(only_first, only_second), count,
-    )  # fmt: skip
+        float(np.mean(first)),
+        float(np.mean(second)),
+        only_first,
+        only_second,
+        _newcombe(both, only_second, only_first, neither),
+        mcnemar(only_first, only_second),
+        count,
+    )
 
 
 def _newcombe(both: int, only_one: int, only_other: int, neither: int) -> tuple[float, float]:
@@ -131,10 +136,15 @@ def paired_errors(first_m: NDArray[np.float64], second_m: NDArray[np.float64]) -
         means.append(difference[rows].mean(axis=1))
         medians.append(np.median(difference[rows], axis=1))
     return PairedErrors(
-        float(np.median(first_m[both])), float(np.median(second_m[both])),
-        float(difference.mean()), _percentiles(np.concatenate(means)),
-        float(np.median(difference)), _percentiles(np.concatenate(medians)), _signed_rank(difference), int(both.sum()),
-    )  # fmt: skip
+        float(np.median(first_m[both])),
+        float(np.median(second_m[both])),
+        float(difference.mean()),
+        _percentiles(np.concatenate(means)),
+        float(np.median(difference)),
+        _percentiles(np.concatenate(medians)),
+        _signed_rank(difference),
+        int(both.sum()),
+    )
 
 
 def _signed_rank(difference: NDArray[np.float64]) -> float:

@@ -177,7 +177,7 @@ def predict(
     answers: list[tuple[Answer | None, float]] = []
     with ThreadPoolExecutor(workers) as pool:
         for done, answer in enumerate(
-            _in_order(
+            in_order(
                 pool,
                 lambda k: _ask(localizer, groups[k], k, refine=refine, prior_of=prior_of, seen_by=seen_by),
                 range(len(groups)),
@@ -190,8 +190,15 @@ def predict(
     return _table(localizer, [group[-1] for group in groups], answers)
 
 
-def _in_order(pool: ThreadPoolExecutor, work: Callable[[T], R], items: Iterable[T], *, ahead: int) -> Iterator[R]:
-    """Yield the results in the order of the items, with at most ``ahead`` items in memory."""
+def in_order(pool: ThreadPoolExecutor, work: Callable[[T], R], items: Iterable[T], *, ahead: int) -> Iterator[R]:
+    """Yield the results in the order of the items, with at most ``ahead`` items in memory.
+
+    Args:
+        pool: threads that do the work.
+        work: function of one item.
+        items: the items.
+        ahead: largest number of items that are submitted at a time.
+    """
     rest = iter(items)
     waiting = [pool.submit(work, item) for item in islice(rest, ahead)]
     while waiting:

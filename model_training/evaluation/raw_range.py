@@ -93,10 +93,12 @@ def raw_best_views(
     best = {name: np.full(len(usable), -1, np.int64) for name in SETTINGS}
     score = {name: np.full(len(usable), -np.inf, np.float32) for name in SETTINGS}
     settings = BuildSettings(
-        name=bundle.name, spacing_m=bundle.manifest.spacing_m, headings=bundle.manifest.headings,
+        name=bundle.name,
+        spacing_m=bundle.manifest.spacing_m,
+        headings=bundle.manifest.headings,
         expected_lidar_height_m=bundle.manifest.parameters["expected_lidar_height_m"],
         remove_weather=bool(bundle.manifest.parameters["weather_removed"]),
-    )  # fmt: skip
+    )
     waiting: list[Ranges] = []
     first = 0
     total = bundle.manifest.counts.places

@@ -159,16 +159,24 @@ def save_run(folder: Path, bundle: MapBundle, dataset: Dataset, evaluation: Eval
     (folder / ANSWERS).mkdir(parents=True, exist_ok=True)
     conditions = _conditions(dataset.description.source)
     sets = tuple(
-        RunSet(name=name, split=evaluation.figures["sets"][name]["split"], queries=len(p.T_true), condition=conditions.get(name))
+        RunSet(
+            name=name,
+            split=evaluation.figures["sets"][name]["split"],
+            queries=len(p.T_true),
+            condition=conditions.get(name),
+        )
         for name, p in evaluation.predictions.items()
-    )  # fmt: skip
+    )
     settings = RunSettings(
         map=RunMap(name=bundle.name, version=bundle.manifest.version, path=str(bundle.path.resolve())),
         dataset=RunData(name=dataset.name, path=str(dataset.folder.resolve())),
-        registered=evaluation.figures["registered"], sets=sets,
+        registered=evaluation.figures["registered"],
+        sets=sets,
         streets=() if bundle.streets is None else tuple(street.name for street in bundle.streets.features),
-        streetfix=version("streetfix"), commit=commit_of(Path(__file__)), made_at=datetime.now(UTC),
-    )  # fmt: skip
+        streetfix=version("streetfix"),
+        commit=commit_of(Path(__file__)),
+        made_at=datetime.now(UTC),
+    )
     for name, answers in evaluation.predictions.items():
         answers.save(folder / ANSWERS / f"{name}.npz")
     _write(folder / FILE, settings.model_dump_json(indent=1))
@@ -187,9 +195,10 @@ def _conditions(source: dict[str, Any]) -> dict[str, str]:
     queries = (source.get("plan") or {}).get("queries", [])
     return {
         f"{query['name']}_{depth}": str(query.get("condition", "clear"))
-        for query in queries if isinstance(query, dict) and "name" in query
+        for query in queries
+        if isinstance(query, dict) and "name" in query
         for depth in query.get("depths", ["precise"])
-    }  # fmt: skip
+    }
 
 
 def commit_of(file: Path) -> str | None:

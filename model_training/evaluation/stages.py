@@ -157,14 +157,21 @@ def _stages(localizer: Localizer, cloud: SurfelMap, asked: QueryFrame, truth: Tr
     near = [rank for rank, away in enumerate(away_m, 1) if away <= RIGHT_PLACE_M]
     from_truth_m, at_truth, from_truth = _from_truth(localizer, cloud, frame, truth)
     found = QueryStages(
-        number=asked.number, tilt_deg=tilt_deg, height_error_m=height_error_m, rank=near[0] if near else 0,
+        number=asked.number,
+        tilt_deg=tilt_deg,
+        height_error_m=height_error_m,
+        rank=near[0] if near else 0,
         start_m=_nearest(((s.R_map_level, s.camera_m) for s in starts), truth, heading, START_DEG),
-        candidate_m=_nearest(_candidates(answer, frame), truth, heading, HEADING_DEG), from_truth_m=from_truth_m,
-        inliers_at_truth=at_truth, inliers_from_truth=from_truth,
+        candidate_m=_nearest(_candidates(answer, frame), truth, heading, HEADING_DEG),
+        from_truth_m=from_truth_m,
+        inliers_at_truth=at_truth,
+        inliers_from_truth=from_truth,
         error_m=float(np.hypot(*(T_answer[:2, 3] - truth[:2, 3]))),
         heading_error_deg=abs(float(np.rad2deg(wrap_angle(heading_of_camera(T_answer) - heading)))),
-        status=answer.status, confidence=np.nan if answer.confidence is None else answer.confidence, noise=frame.noise,
-    )  # fmt: skip
+        status=answer.status,
+        confidence=np.nan if answer.confidence is None else answer.confidence,
+        noise=frame.noise,
+    )
     return replace(found, lost=loses(found))
 
 
@@ -229,9 +236,13 @@ def _from_truth(localizer: Localizer, cloud: SurfelMap, frame: Frame, truth: Tra
         settings = settings_for_rig(settings, rig_px_m)
     blocks = blocks_of(frame.query.depth_m, frame.query.camera, settings.points, noise=frame.noise)
     points = points_from(
-        blocks, frame.R_level_camera, frame.views.height_m, settings.points, noise=frame.noise,
+        blocks,
+        frame.R_level_camera,
+        frame.views.height_m,
+        settings.points,
+        noise=frame.noise,
         focal_baseline_px_m=settings.focal_baseline_px_m,
-    )  # fmt: skip
+    )
     if len(points) < settings.fewest_points:
         return np.inf, np.nan, np.nan
     start = Start(truth[:3, :3] @ frame.R_level_camera.T, truth[:3, 3], 0)

@@ -20,10 +20,13 @@ BagFormat = Literal["mcap", "sqlite3", "bag"]
 VEHICLE, LIDAR, CAMERA, MAP = "base_link", "lidar", "camera", "map"
 #: Message type of each topic.
 TOPICS = {
-    "/points": "sensor_msgs/msg/PointCloud2", "/camera/color/image_raw": "sensor_msgs/msg/Image",
-    "/camera/depth/image_raw": "sensor_msgs/msg/Image", "/camera/color/camera_info": "sensor_msgs/msg/CameraInfo",
-    "/odometry": "nav_msgs/msg/Odometry", "/tf_static": "tf2_msgs/msg/TFMessage",
-}  # fmt: skip
+    "/points": "sensor_msgs/msg/PointCloud2",
+    "/camera/color/image_raw": "sensor_msgs/msg/Image",
+    "/camera/depth/image_raw": "sensor_msgs/msg/Image",
+    "/camera/color/camera_info": "sensor_msgs/msg/CameraInfo",
+    "/odometry": "nav_msgs/msg/Odometry",
+    "/tf_static": "tf2_msgs/msg/TFMessage",
+}
 Send = Callable[[str, float, Any], None]
 
 
@@ -84,7 +87,9 @@ def _writing(out: Path, kind: BagFormat) -> Iterator[tuple[dict[str, Any], Send]
             plugin = rosbag2.StoragePlugin.MCAP if kind == "mcap" else rosbag2.StoragePlugin.SQLITE3
             writer = rosbag2.Writer(part, version=9, storage_plugin=plugin)
         with writer:
-            connections = {topic: writer.add_connection(topic, msgtype, typestore=store) for topic, msgtype in TOPICS.items()}  # fmt: skip
+            connections = {
+                topic: writer.add_connection(topic, msgtype, typestore=store) for topic, msgtype in TOPICS.items()
+            }
 
             def send(topic: str, stamp_s: float, message: Any) -> None:
                 serialize = store.serialize_ros1 if kind == "bag" else store.serialize_cdr
@@ -146,9 +151,15 @@ class _Messages:
     def _image(self, stamp_s: float, pixels: Any, encoding: str) -> Any:
         data = np.ascontiguousarray(pixels)
         return self._make(
-            "sensor_msgs/msg/Image", header=self._header(stamp_s, CAMERA), height=data.shape[0], width=data.shape[1],
-            encoding=encoding, is_bigendian=0, step=data.strides[0], data=data.view(np.uint8).reshape(-1),
-        )  # fmt: skip
+            "sensor_msgs/msg/Image",
+            header=self._header(stamp_s, CAMERA),
+            height=data.shape[0],
+            width=data.shape[1],
+            encoding=encoding,
+            is_bigendian=0,
+            step=data.strides[0],
+            data=data.view(np.uint8).reshape(-1),
+        )
 
     def _info(self, stamp_s: float, camera: CameraSensor) -> Any:
         name = "sensor_msgs/msg/CameraInfo"
@@ -160,9 +171,16 @@ class _Messages:
             "sensor_msgs/msg/RegionOfInterest", x_offset=0, y_offset=0, height=0, width=0, do_rectify=False
         )
         return self._make(
-            name, header=self._header(stamp_s, CAMERA), height=camera.height, width=camera.width, distortion_model="plumb_bob",
-            binning_x=0, binning_y=0, roi=roi, **{(key.upper() if upper else key): value for key, value in matrices.items()},
-        )  # fmt: skip
+            name,
+            header=self._header(stamp_s, CAMERA),
+            height=camera.height,
+            width=camera.width,
+            distortion_model="plumb_bob",
+            binning_x=0,
+            binning_y=0,
+            roi=roi,
+            **{(key.upper() if upper else key): value for key, value in matrices.items()},
+        )
 
     def _cloud(self, stamp_s: float, points: Any) -> Any:
         data = np.ascontiguousarray(points, "<f4")
@@ -171,9 +189,17 @@ class _Messages:
             for k, name in enumerate(("x", "y", "z", "intensity"))
         ]
         return self._make(
-            "sensor_msgs/msg/PointCloud2", header=self._header(stamp_s, LIDAR), height=1, width=len(data), fields=fields,
-            is_bigendian=False, point_step=16, row_step=16 * len(data), data=data.view(np.uint8).reshape(-1), is_dense=True,
-        )  # fmt: skip
+            "sensor_msgs/msg/PointCloud2",
+            header=self._header(stamp_s, LIDAR),
+            height=1,
+            width=len(data),
+            fields=fields,
+            is_bigendian=False,
+            point_step=16,
+            row_step=16 * len(data),
+            data=data.view(np.uint8).reshape(-1),
+            is_dense=True,
+        )
 
     def _odometry(self, moment: Moment) -> Any:
         point, quaternion = self._vectors(moment.T_map_vehicle)
@@ -182,10 +208,12 @@ class _Messages:
         twist = self._make("geometry_msgs/msg/Twist", linear=zero, angular=zero)
         unknown = np.zeros(36)
         return self._make(
-            "nav_msgs/msg/Odometry", header=self._header(moment.stamp_s, MAP), child_frame_id=VEHICLE,
+            "nav_msgs/msg/Odometry",
+            header=self._header(moment.stamp_s, MAP),
+            child_frame_id=VEHICLE,
             pose=self._make("geometry_msgs/msg/PoseWithCovariance", pose=pose, covariance=unknown),
             twist=self._make("geometry_msgs/msg/TwistWithCovariance", twist=twist, covariance=unknown),
-        )  # fmt: skip
+        )
 
     def _edge(self, stamp_s: float, child: str, T: Transform) -> Any:
         point, quaternion = self._vectors(T)
@@ -193,8 +221,11 @@ class _Messages:
             "geometry_msgs/msg/Transform", translation=point("geometry_msgs/msg/Vector3"), rotation=quaternion
         )
         return self._make(
-            "geometry_msgs/msg/TransformStamped", header=self._header(stamp_s, VEHICLE), child_frame_id=child, transform=transform
-        )  # fmt: skip
+            "geometry_msgs/msg/TransformStamped",
+            header=self._header(stamp_s, VEHICLE),
+            child_frame_id=child,
+            transform=transform,
+        )
 
     def _vectors(self, T: Transform) -> tuple[Callable[[str], Any], Any]:
         x, y, z, w = (float(value) for value in quaternion_xyzw_from(T[:3, :3]))

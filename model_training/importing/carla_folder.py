@@ -136,9 +136,13 @@ class CarlaFolder:
         """The LiDAR in our convention."""
         lidar = self.told.lidar
         return LidarSensor(
-            name="carla", channels=lidar.channels, top_deg=lidar.upper_fov_deg, bottom_deg=lidar.lower_fov_deg,
-            max_range_m=lidar.range_m, T_vehicle_sensor=lidar.mounting.T_vehicle_sensor().tolist(),
-        )  # fmt: skip
+            name="carla",
+            channels=lidar.channels,
+            top_deg=lidar.upper_fov_deg,
+            bottom_deg=lidar.lower_fov_deg,
+            max_range_m=lidar.range_m,
+            T_vehicle_sensor=lidar.mounting.T_vehicle_sensor().tolist(),
+        )
 
     @property
     def notes(self) -> Notes:

@@ -31,11 +31,13 @@ def T_from_carla(x: float, y: float, z: float, roll_deg: float, pitch_deg: float
     """
     roll, pitch, yaw = np.deg2rad([roll_deg, pitch_deg, yaw_deg])
     cr, sr, cp, sp, cy, sy = np.cos(roll), np.sin(roll), np.cos(pitch), np.sin(pitch), np.cos(yaw), np.sin(yaw)
-    R = np.array([
-        [cp * cy, cy * sp * sr - sy * cr, -cy * sp * cr - sy * sr],
-        [cp * sy, sy * sp * sr + cy * cr, -sy * sp * cr + cy * sr],
-        [sp, -cp * sr, cp * cr],
-    ])  # fmt: skip
+    R = np.array(
+        [
+            [cp * cy, cy * sp * sr - sy * cr, -cy * sp * cr - sy * sr],
+            [cp * sy, sy * sp * sr + cy * cr, -sy * sp * cr + cy * sr],
+            [sp, -cp * sr, cp * cr],
+        ]
+    )
     return transform_from(_MIRROR @ R @ _MIRROR, _MIRROR @ np.array([x, y, z]))
 
 

@@ -214,10 +214,13 @@ def attributes(kind: str, settings: RecordSettings) -> dict[str, str]:
     if kind == "lidar":
         lidar = settings.lidar
         return {
-            "channels": str(lidar.channels), "upper_fov": str(lidar.upper_fov_deg), "lower_fov": str(lidar.lower_fov_deg),
-            "range": str(lidar.range_m), "rotation_frequency": str(1.0 / settings.step_s),
+            "channels": str(lidar.channels),
+            "upper_fov": str(lidar.upper_fov_deg),
+            "lower_fov": str(lidar.lower_fov_deg),
+            "range": str(lidar.range_m),
+            "rotation_frequency": str(1.0 / settings.step_s),
             "points_per_second": str(int(lidar.channels * 1024 / settings.step_s)),
-        }  # fmt: skip
+        }
     camera = settings.camera
     return {"image_size_x": str(camera.width), "image_size_y": str(camera.height), "fov": str(camera.fov_deg)}
 

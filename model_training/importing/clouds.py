@@ -64,7 +64,11 @@ class Clouds:
         del pictures
         for path, stamp_s in zip(self.files, self.stamps_s, strict=True):
             points = read_cloud(path)
-            yield Unusable("scan", path.name, points) if isinstance(points, str) else RecordedScan(path.name, stamp_s, points)  # fmt: skip
+            yield (
+                Unusable("scan", path.name, points)
+                if isinstance(points, str)
+                else RecordedScan(path.name, stamp_s, points)
+            )
 
 
 def open_clouds(source: Path, poses: Path | None = None) -> Clouds:

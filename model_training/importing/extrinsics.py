@@ -71,8 +71,14 @@ def read_camera(path: Path) -> PinholeCamera:
     if not all(np.isfinite(x) and x > 0 for key, x in numbers.items() if key not in ("cx", "cy")):
         raise DatasetError(f"{path}: width, height, fx and fy must be more than 0", field="camera")
     return PinholeCamera(
-        int(numbers["width"]), int(numbers["height"]), numbers["fx"], numbers["fy"], numbers["cx"], numbers["cy"], distortion
-    )  # fmt: skip
+        int(numbers["width"]),
+        int(numbers["height"]),
+        numbers["fx"],
+        numbers["fy"],
+        numbers["cx"],
+        numbers["cy"],
+        distortion,
+    )
 
 
 def _rigid(path: Path, key: str, value: object) -> Transform:

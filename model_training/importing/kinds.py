@@ -150,9 +150,13 @@ def _rosbag(source: Path, settings: OpenSettings) -> Recording:
     from model_training.importing.ros_content import BagSettings
 
     bag = BagSettings(
-        settings.topics, extrinsics=settings.extrinsics or Extrinsics(), camera=settings.camera, rectified=settings.rectified,
-        want_pictures=settings.pictures, want_depth=settings.depth == "recorded",
-    )  # fmt: skip
+        settings.topics,
+        extrinsics=settings.extrinsics or Extrinsics(),
+        camera=settings.camera,
+        rectified=settings.rectified,
+        want_pictures=settings.pictures,
+        want_depth=settings.depth == "recorded",
+    )
     return RosBag(source, bag)
 
 

@@ -83,9 +83,13 @@ def calibration_from(path: Path, *, P2: Matrix, P3: Matrix | None, R0: Matrix, T
         )
     translation = R0 @ Tr[:, 3] + np.linalg.solve(K, P2[:, 3])
     return KittiCalibration(
-        fx=float(K[0, 0]), fy=float(K[1, 1]), cx=float(K[0, 2]), cy=float(K[1, 2]), focal_baseline_px_m=baseline,
+        fx=float(K[0, 0]),
+        fy=float(K[1, 1]),
+        cx=float(K[0, 2]),
+        cy=float(K[1, 2]),
+        focal_baseline_px_m=baseline,
         T_camera_lidar=transform_from(rotation, translation),
-    )  # fmt: skip
+    )
 
 
 def read_matrices(

@@ -46,7 +46,9 @@ def open_kitti_odometry(source: Path, *, depth: KittiDepth, vertical_deg: float 
     calibration, T_lidar_cam0 = _calibration(source / "calib.txt", *eyes)
     numbers = sorted(scans.keys() | left.keys())
     stamps = _times(source / "times.txt", numbers[-1])
-    frames = tuple(KittiFrame(f"{n:06d}", stamps[n], scans.get(n), left.get(n), right.get(n), stored.get(n)) for n in numbers)  # fmt: skip
+    frames = tuple(
+        KittiFrame(f"{n:06d}", stamps[n], scans.get(n), left.get(n), right.get(n), stored.get(n)) for n in numbers
+    )
     poses = _poses(source.parent.parent / "poses" / f"{source.name}.txt", stamps, T_lidar_cam0)
     return KittiSequence("kitti-odometry", source, frames, calibration, depth, poses, vertical_deg=vertical_deg)
 

@@ -57,9 +57,16 @@ def open_kitti_raw(source: Path, *, depth: KittiDepth, vertical_deg: float = KIT
     )
     poses, georeference = _poses(drive)
     return KittiSequence(
-        "kitti-raw", drive, frames, calibration, depth, poses, georeference, turn_s=None if at_rest else turn_of(times),
+        "kitti-raw",
+        drive,
+        frames,
+        calibration,
+        depth,
+        poses,
+        georeference,
+        turn_s=None if at_rest else turn_of(times),
         vertical_deg=0.0 if at_rest else vertical_deg,
-    )  # fmt: skip
+    )
 
 
 def _drive(source: Path) -> Path:
@@ -96,8 +103,9 @@ def _calibration_file(drive: Path, name: str) -> Path:
     if found is None:
         raise DatasetError(
             f"{drive}: {name} not found, neither in the folder of the drive nor next to it; put the "
-            "calibration of that day there (KITTI's DATE_calib.zip)", field=name,
-        )  # fmt: skip
+            "calibration of that day there (KITTI's DATE_calib.zip)",
+            field=name,
+        )
     return found
 
 

@@ -89,9 +89,11 @@ class KittiSequence:
             sum(getattr(frame, kind) is not None for frame in self.frames) for kind in ("scan", "left", "right")
         )
         source: dict[str, Any] = {
-            "path": self.path.name, "depth": self.depth, "vertical_correction_deg": self.vertical_deg,
+            "path": self.path.name,
+            "depth": self.depth,
+            "vertical_correction_deg": self.vertical_deg,
             "point_times": "none" if self.turn_s is None else "azimuth",
-        }  # fmt: skip
+        }
         if self.turn_s is not None:
             source["turn_s"] = self.turn_s
         if self.depth == "sgbm":
@@ -169,10 +171,18 @@ class KittiSequence:
         name, calibration = f"image {frame.name}", self.calibration
         try:
             rgb = read_rgb(left)
-            camera = PinholeCamera(rgb.shape[1], rgb.shape[0], calibration.fx, calibration.fy, calibration.cx, calibration.cy)  # fmt: skip
+            camera = PinholeCamera(
+                rgb.shape[1], rgb.shape[0], calibration.fx, calibration.fy, calibration.cx, calibration.cy
+            )
             picture = RecordedPicture(
-                name, frame.stamp_s, rgb, camera, inverse(calibration.T_camera_lidar), depth_scale_m=STORED_SCALE_M, file=left
-            )  # fmt: skip
+                name,
+                frame.stamp_s,
+                rgb,
+                camera,
+                inverse(calibration.T_camera_lidar),
+                depth_scale_m=STORED_SCALE_M,
+                file=left,
+            )
             if self.depth == "stored":
                 if frame.stored is None:
                     return Unusable("image", name, f"no stored depth beside it; {choices}")

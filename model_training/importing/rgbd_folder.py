@@ -123,8 +123,15 @@ class RgbdFolder:
                 "image", frame.rgb.name, f"sizes differ: colour {rgb.shape[:2]}, depth {depth.shape}, camera {size}"
             )
         return RecordedPicture(
-            frame.rgb.name, frame.stamp_s, rgb, self.camera, _AHEAD, depth=depth, depth_scale_m=self.scale_m, file=frame.rgb
-        )  # fmt: skip
+            frame.rgb.name,
+            frame.stamp_s,
+            rgb,
+            self.camera,
+            _AHEAD,
+            depth=depth,
+            depth_scale_m=self.scale_m,
+            file=frame.rgb,
+        )
 
 
 def open_tum_rgbd(source: Path, camera: PinholeCamera | None) -> RgbdFolder:

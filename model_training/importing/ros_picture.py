@@ -14,9 +14,14 @@ from service.imaging.ros_depth import read_ros_depth
 
 #: By encoding: number of channels, and the channels for red, green and blue. Grey is repeated.
 _COLOUR = {
-    "rgb8": (3, (0, 1, 2)), "bgr8": (3, (2, 1, 0)), "rgba8": (4, (0, 1, 2)), "bgra8": (4, (2, 1, 0)), "mono8": (1, (0, 0, 0)),
-    "8UC1": (1, (0, 0, 0)), "8UC3": (3, (2, 1, 0)),
-}  # fmt: skip
+    "rgb8": (3, (0, 1, 2)),
+    "bgr8": (3, (2, 1, 0)),
+    "rgba8": (4, (0, 1, 2)),
+    "bgra8": (4, (2, 1, 0)),
+    "mono8": (1, (0, 0, 0)),
+    "8UC1": (1, (0, 0, 0)),
+    "8UC3": (3, (2, 1, 0)),
+}
 _DEPTH = {"16UC1": "u2", "mono16": "u2", "32FC1": "f4"}
 _PINHOLE_MODELS = ("", "plumb_bob", "rational_polynomial")
 _FISHEYE_MODELS = ("equidistant", "fisheye", "kannala_brandt4")
@@ -106,9 +111,14 @@ def camera_of(message: Any, *, is_rectified: bool) -> tuple[PinholeCamera, Lens]
         wanted = " or ".join(str(n) for n in _COEFFICIENTS[lens])
         return f"distortion_model {model!r} has {len(distortion)} coefficients; expected {wanted} finite ones"
     camera = PinholeCamera(
-        int(message.width), int(message.height), float(matrix[0, 0]), float(matrix[1, 1]), float(matrix[0, 2]), float(matrix[1, 2]),
+        int(message.width),
+        int(message.height),
+        float(matrix[0, 0]),
+        float(matrix[1, 1]),
+        float(matrix[0, 2]),
+        float(matrix[1, 2]),
         distortion,
-    )  # fmt: skip
+    )
     return camera, lens
 
 
@@ -122,7 +132,9 @@ def _pixels(message: Any, dtype: str, channels: int) -> NDArray[Any] | str:
         return f"its data have too few bytes for {width}x{height} {message.encoding}: truncated"
     order = ">" if message.is_bigendian else "<"
     rows: NDArray[Any] = np.ndarray(
-        (height, width, channels), np.dtype(order + dtype), np.ascontiguousarray(message.data).data,
+        (height, width, channels),
+        np.dtype(order + dtype),
+        np.ascontiguousarray(message.data).data,
         strides=(step, channels * size, size),
-    )  # fmt: skip
+    )
     return rows.astype(np.dtype(dtype), copy=False)

@@ -16,9 +16,12 @@ POSE_TYPES = (
 )
 _IMAGE_TYPES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
 _TYPES: dict[str, tuple[str, ...]] = {
-    "scan": ("sensor_msgs/msg/PointCloud2",), "color": _IMAGE_TYPES, "depth": _IMAGE_TYPES, "info": ("sensor_msgs/msg/CameraInfo",),
+    "scan": ("sensor_msgs/msg/PointCloud2",),
+    "color": _IMAGE_TYPES,
+    "depth": _IMAGE_TYPES,
+    "info": ("sensor_msgs/msg/CameraInfo",),
     "poses": POSE_TYPES,
-}  # fmt: skip
+}
 
 
 @dataclass(frozen=True, slots=True)
@@ -104,9 +107,13 @@ def topics_of(available: list[Topic], told: Mapping[str, str], *, source: str) -
             f"{source} has no sensor_msgs/PointCloud2, so there is no survey in it; it has: {have}", field="scan"
         )
     return Topics(
-        scan=chosen["scan"], color=chosen.get("color"), depth=chosen.get("depth"), info=chosen.get("info"),
-        poses=chosen.get("poses"), guessed=tuple(role for role in ROLES if role not in told),
-    )  # fmt: skip
+        scan=chosen["scan"],
+        color=chosen.get("color"),
+        depth=chosen.get("depth"),
+        info=chosen.get("info"),
+        poses=chosen.get("poses"),
+        guessed=tuple(role for role in ROLES if role not in told),
+    )
 
 
 def _guess(role: str, available: list[Topic], chosen: Mapping[str, Topic]) -> Topic | None:

@@ -215,13 +215,21 @@ class _Taking:
             "dropped": self.dropped.lines(),
         }
         description = DatasetDescription(
-            name=name, source=source, sensors=Sensors(lidars=[recording.lidar], cameras=cameras), georeference=recording.georeference
-        )  # fmt: skip
+            name=name,
+            source=source,
+            sensors=Sensors(lidars=[recording.lidar], cameras=cameras),
+            georeference=recording.georeference,
+        )
         write_description(self._out, description)
         return TakeSummary(
-            self._survey.count, self._held, self._queries.count, self._without_numbers, tuple(self.dropped.lines()), recording.notes.lines,
+            self._survey.count,
+            self._held,
+            self._queries.count,
+            self._without_numbers,
+            tuple(self.dropped.lines()),
+            recording.notes.lines,
             self._deskewed,
-        )  # fmt: skip
+        )
 
     def _useless(self, scan: RecordedScan, finite: NDArray[np.bool_]) -> str | None:
         if not finite.any():

@@ -91,10 +91,16 @@ class QueryWriter:
     def _camera_name(self, picture: RecordedPicture, scale_m: float) -> str:
         pinhole = picture.camera
         camera = CameraSensor(
-            name=f"camera-{len(self._cameras)}", width=pinhole.width, height=pinhole.height, fx=pinhole.fx, fy=pinhole.fy,
-            cx=pinhole.cx, cy=pinhole.cy, depth=DepthSpec(scale_m=scale_m, baseline_m=picture.baseline_m),
+            name=f"camera-{len(self._cameras)}",
+            width=pinhole.width,
+            height=pinhole.height,
+            fx=pinhole.fx,
+            fy=pinhole.fy,
+            cx=pinhole.cx,
+            cy=pinhole.cy,
+            depth=DepthSpec(scale_m=scale_m, baseline_m=picture.baseline_m),
             T_vehicle_sensor=picture.T_vehicle_camera.tolist(),
-        )  # fmt: skip
+        )
         for known in self._cameras:
             if known.model_dump(exclude={"name"}) == camera.model_dump(exclude={"name"}):
                 return known.name

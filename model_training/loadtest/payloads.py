@@ -82,11 +82,15 @@ def _payload(frame: QueryFrame, map_name: str | None, refine: bool, cheap_depth:
         for name, content in parts.items()
     )
     message = pb.LocalizeRequest(
-        rgb=rgb, depth=depth, camera=pb.Camera(**document["camera"]), map=map_name, options=pb.Options(refine=refine),
+        rgb=rgb,
+        depth=depth,
+        camera=pb.Camera(**document["camera"]),
+        map=map_name,
+        options=pb.Options(refine=refine),
         depth_format=pb.DepthFormat(
             scale_m=spec.scale_m, kind=_KINDS[spec.kind], baseline_m=spec.baseline_m, max_range_m=spec.max_range_m
         ),
-    )  # fmt: skip
+    )
     true_m = None if frame.T_map_camera is None else frame.T_map_camera[:3, 3].copy()
     return Payload(body + f"--{boundary}--\r\n".encode(), f"multipart/form-data; boundary={boundary}", message, true_m)
 

@@ -87,16 +87,21 @@ def summarise(
     ]
     used = None if before is None or after is None else after.cpu_s - before.cpu_s
     return Summary(
-        rate=load.rate, concurrency=load.concurrency, offered_per_s=len(counted) / load.duration_s,
-        answered_per_s=in_time / load.duration_s, answered_ms=_percentiles([shot.done_s - shot.due_s for shot in answered]),
+        rate=load.rate,
+        concurrency=load.concurrency,
+        offered_per_s=len(counted) / load.duration_s,
+        answered_per_s=in_time / load.duration_s,
+        answered_ms=_percentiles([shot.done_s - shot.due_s for shot in answered]),
         refused_ms=_percentiles([shot.done_s - shot.due_s for shot in refused]),
         late_ms=_percentiles([shot.sent_s - shot.due_s for shot in counted]),
-        errors=dict(Counter(shot.reply.code for shot in refused)), answers=len(answered),
+        errors=dict(Counter(shot.reply.code for shot in refused)),
+        answers=len(answered),
         localized=len(localized) / len(answered) if answered else None,
-        right=float(np.mean(np.array(distances) <= RIGHT_M)) if distances else None, inconsistent=inconsistent,
+        right=float(np.mean(np.array(distances) <= RIGHT_M)) if distances else None,
+        inconsistent=inconsistent,
         cpu_ms_per_answer=None if used is None or not in_time else 1e3 * used / in_time,
         resident_mib=None if after is None else after.resident_mib,
-    )  # fmt: skip
+    )
 
 
 def _same(one: Reply, other: Reply) -> bool:

@@ -80,9 +80,11 @@ class Rest:
     async def __aenter__(self) -> Self:
         """Open a session without a limit of connections."""
         self._session = aiohttp.ClientSession(
-            connector=aiohttp.TCPConnector(limit=0, ssl=self._context()), headers=self._headers, auto_decompress=False,
+            connector=aiohttp.TCPConnector(limit=0, ssl=self._context()),
+            headers=self._headers,
+            auto_decompress=False,
             trust_env=self._url.host not in ("127.0.0.1", "localhost", "::1"),
-        )  # fmt: skip
+        )
         return self
 
     async def __aexit__(
@@ -106,9 +108,11 @@ class Rest:
         body = payload.body if len(payload.body) <= _AT_ONCE_BYTES else io.BytesIO(payload.body)
         try:
             async with self._session.post(
-                self._url, data=body, headers={"Content-Type": payload.content_type},
+                self._url,
+                data=body,
+                headers={"Content-Type": payload.content_type},
                 timeout=aiohttp.ClientTimeout(total=timeout_s),
-            ) as response:  # fmt: skip
+            ) as response:
                 content = await response.read()
         except TimeoutError:
             return Reply("timeout")
@@ -119,8 +123,11 @@ class Rest:
         answer = json.loads(content)
         pose, spread = answer["pose"], answer["spread"]
         return Reply(
-            "ok", answer["status"], None if pose is None else _xyz(pose["position"]), None if spread is None else _xyz(spread["mean"])
-        )  # fmt: skip
+            "ok",
+            answer["status"],
+            None if pose is None else _xyz(pose["position"]),
+            None if spread is None else _xyz(spread["mean"]),
+        )
 
 
 def _xyz(vector: dict[str, float]) -> tuple[float, float, float]:
@@ -176,6 +183,8 @@ class Grpc:
         at, mean = answer.pose.position, answer.spread.mean
         status = pb.LocalizationStatus.Name(answer.status).removeprefix("LOCALIZATION_STATUS_")
         return Reply(
-            "ok", status, (at.x, at.y, at.z) if answer.HasField("pose") else None,
+            "ok",
+            status,
+            (at.x, at.y, at.z) if answer.HasField("pose") else None,
             (mean.x, mean.y, mean.z) if answer.HasField("spread") else None,
-        )  # fmt: skip
+        )

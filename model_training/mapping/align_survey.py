@@ -35,9 +35,17 @@ OFF_M = 0.5
 #: A scan with fewer points than this on surfaces that another scan has measured keeps its pose.
 FEWEST = 300
 _SOLVER = SolverOptions(
-    iterations=6, reach=OFF_M, robust_first=0.1, robust_last=0.05, surface=SURFACE_M, prior_weight=HELD_BY / POINTS, tilt=TILT_RAD,
-    height=POSITION_M, position=POSITION_M, free_scale=False,
-)  # fmt: skip
+    iterations=6,
+    reach=OFF_M,
+    robust_first=0.1,
+    robust_last=0.05,
+    surface=SURFACE_M,
+    prior_weight=HELD_BY / POINTS,
+    tilt=TILT_RAD,
+    height=POSITION_M,
+    position=POSITION_M,
+    free_scale=False,
+)
 
 #: Number of scans whose points go into the voxel map at once.
 _TOGETHER = 64

@@ -93,8 +93,8 @@ def build_map(
         # 4. Dynamic objects: traffic first, then what other passes see through.
         for wanted, each_scan in ((settings.traffic_vote, True), (settings.passes_vote, False)):
             if wanted:
-                gone = stages.dynamic_voxels(cloud, poses, each_scan=each_scan)
-                cloud.keep(~np.isin(cloud.sums()[0], gone))
+                dynamic = stages.dynamic_voxels(cloud, poses, each_scan=each_scan)
+                cloud.keep(~np.isin(cloud.sums()[0], dynamic))
         # 5. The bundle.
         report("writing", 0, 2)
         content = with_cloud(content, cloud)
@@ -118,20 +118,37 @@ def _content(drive: Drive, places: Places, encoder_file: Path) -> BundleContent:
     votes = {"passes_vote": settings.passes_vote, "traffic_vote": settings.traffic_vote}
     done = {name: 1.0 for name, wanted in {**votes, "survey_aligned": settings.align_survey}.items() if wanted}
     return BundleContent(
-        name=settings.name, grid=drive.grid, headings=settings.headings, spacing_m=settings.spacing_m, rows_seen=drive.rows_seen,
-        T_map_place=T_map_place, place_street=streets_of(streets, T_map_place),
-        view_place=views_of(len(T_map_place), settings.headings), view_heading_rad=places.heading_rad.ravel(),
-        descriptors=places.descriptors, encoder=encoder_file.read_bytes(), streets=streets,
+        name=settings.name,
+        grid=drive.grid,
+        headings=settings.headings,
+        spacing_m=settings.spacing_m,
+        rows_seen=drive.rows_seen,
+        T_map_place=T_map_place,
+        place_street=streets_of(streets, T_map_place),
+        view_place=views_of(len(T_map_place), settings.headings),
+        view_heading_rad=places.heading_rad.ravel(),
+        descriptors=places.descriptors,
+        encoder=encoder_file.read_bytes(),
+        streets=streets,
         georeference=dataset.description.georeference,
-        calibration={"calibrated": False, "why": "no calibration fits this map's encoder; answers carry confidence null"},
+        calibration={
+            "calibrated": False,
+            "why": "no calibration exists for the encoder of this map, so answers have no confidence",
+        },
         parameters={
-            "lidar_height_m": lidar_height_m, "voxel_m": settings.voxel_m, "weather_removed": float(settings.remove_weather),
-            "expected_lidar_height_m": settings.expected_lidar_height_m, "survey_scans": float(len(drive.poses)),
-            "between_m": settings.between_m, "places_between": float(places.between), **done,
+            "lidar_height_m": lidar_height_m,
+            "voxel_m": settings.voxel_m,
+            "weather_removed": float(settings.remove_weather),
+            "expected_lidar_height_m": settings.expected_lidar_height_m,
+            "survey_scans": float(len(drive.poses)),
+            "between_m": settings.between_m,
+            "places_between": float(places.between),
+            **settings.survey_accuracy(dataset.description.survey_accuracy),
+            **done,
         },
         licence=settings.licence,
         tool_versions=tool_versions(),
-    )  # fmt: skip
+    )
 
 
 def tool_versions() -> dict[str, str]:

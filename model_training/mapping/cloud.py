@@ -49,6 +49,8 @@ def with_cloud(content: BundleContent, cloud: VoxelMap) -> BundleContent:
     surfels = cloud.surfels()
     preview = preview_webp(surfels.positions, surfels.normals, content.T_map_place[:, :3, 3])
     return replace(
-        content, cloud=prepared(cloud, surfels), statistics=cloud.statistics() if len(surfels.positions) else None,
+        content,
+        cloud=prepared(cloud, surfels),
+        statistics=cloud.statistics() if len(surfels.positions) else None,
         preview_webp=preview,
-    )  # fmt: skip
+    )

@@ -41,13 +41,15 @@ def diff_of(a: MapBundle, b: MapBundle) -> dict[str, Any]:
         "versions": [a.manifest.version, b.manifest.version],
         "places": places,
         "cloud": {
-            "appeared": len(appeared), "vanished": len(vanished), "kept": len(_positions(b)) - len(appeared),
+            "appeared": len(appeared),
+            "vanished": len(vanished),
+            "kept": len(_positions(b)) - len(appeared),
             "areas": _areas(appeared, vanished),
         },
         "streets": _streets(a, b),
         "parameters": _parameters(a, b),
         "encoder_changed": a.manifest.encoder_sha256 != b.manifest.encoder_sha256,
-    }  # fmt: skip
+    }
 
 
 def _places(a: MapBundle, b: MapBundle) -> dict[str, Any]:
@@ -59,14 +61,17 @@ def _places(a: MapBundle, b: MapBundle) -> dict[str, Any]:
     same = (back[nearest] == np.arange(len(old))) & (distance < reach)
     pairs = np.c_[np.flatnonzero(same), nearest[same]]
     turned = [
-        abs((heading_of_body(b.T_map_place[j]) - heading_of_body(a.T_map_place[i]) + np.pi) % (2 * np.pi) - np.pi) for i, j in pairs
-    ]  # fmt: skip
+        abs((heading_of_body(b.T_map_place[j]) - heading_of_body(a.T_map_place[i]) + np.pi) % (2 * np.pi) - np.pi)
+        for i, j in pairs
+    ]
     moved = (distance[same] >= _MOVED_M) | (np.array(turned) >= _TURNED_RAD)
     return {
-        "kept": len(pairs), "moved": int(moved.sum()), "largest_move_m": round(float(distance[same].max(initial=0.0)), 4),
+        "kept": len(pairs),
+        "moved": int(moved.sum()),
+        "largest_move_m": round(float(distance[same].max(initial=0.0)), 4),
         "added": np.setdiff1d(np.arange(len(new)), pairs[:, 1]).tolist(),
         "removed": np.setdiff1d(np.arange(len(old)), pairs[:, 0]).tolist(),
-    }  # fmt: skip
+    }
 
 
 def _positions(bundle: MapBundle) -> NDArray[np.float64]:
@@ -94,22 +99,30 @@ def _areas(appeared: NDArray[np.float64], vanished: NDArray[np.float64]) -> list
     gone = np.bincount(of[len(appeared) :], minlength=len(square))
     order = np.argsort(-(new + gone), kind="stable")
     return [
-        {"x": float((square[k, 0] + 0.5) * AREA_M), "y": float((square[k, 1] + 0.5) * AREA_M), "appeared": int(new[k]),
-         "vanished": int(gone[k])}
+        {
+            "x": float((square[k, 0] + 0.5) * AREA_M),
+            "y": float((square[k, 1] + 0.5) * AREA_M),
+            "appeared": int(new[k]),
+            "vanished": int(gone[k]),
+        }
         for k in order
-    ]  # fmt: skip
+    ]
 
 
 def _streets(a: MapBundle, b: MapBundle) -> dict[str, list[str]]:
     old, new = (
-        {feature["properties"]["id"]: feature for feature in (streets_of_bundle(bundle) or {"features": []})["features"]}
+        {
+            feature["properties"]["id"]: feature
+            for feature in (streets_of_bundle(bundle) or {"features": []})["features"]
+        }
         for bundle in (a, b)
-    )  # fmt: skip
+    )
     both = sorted(old.keys() & new.keys())
     return {
-        "added": sorted(new.keys() - old.keys()), "removed": sorted(old.keys() - new.keys()),
+        "added": sorted(new.keys() - old.keys()),
+        "removed": sorted(old.keys() - new.keys()),
         "changed": [name for name in both if old[name] != new[name]],
-    }  # fmt: skip
+    }
 
 
 def _parameters(a: MapBundle, b: MapBundle) -> dict[str, list[Any]]:

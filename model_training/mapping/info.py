@@ -28,19 +28,33 @@ def info_of(path: Path) -> dict[str, Any]:
     xyz = bundle.T_map_place[:, :3, 3]
     streets = streets_of_bundle(bundle) or {"features": []}
     names = {feature["properties"]["street"]: feature["properties"]["name"] for feature in streets["features"]}
-    site = (
-        None if bundle.calibration is None or bundle.calibration.site is None else bundle.calibration.site.model_dump()
-    )
+    calibration = bundle.calibration
+    site, rig = (None, None) if calibration is None else (calibration.site, calibration.rig)
     return {
-        "name": manifest.name, "version": manifest.version, "format": manifest.format, "made_at": manifest.made_at.isoformat(),
+        "name": manifest.name,
+        "version": manifest.version,
+        "format": manifest.format,
+        "made_at": manifest.made_at.isoformat(),
         "size_bytes": sum(entry.size for entry in manifest.files.values()) + (path / FILE).stat().st_size,
-        "counts": manifest.counts.model_dump(), "headings": manifest.headings, "spacing_m": manifest.spacing_m,
-        "rows_seen": int(np.count_nonzero(bundle.rows_seen)), "rows": manifest.grid.rows,
+        "counts": manifest.counts.model_dump(),
+        "headings": manifest.headings,
+        "spacing_m": manifest.spacing_m,
+        "rows_seen": int(np.count_nonzero(bundle.rows_seen)),
+        "rows": manifest.grid.rows,
         "extent_m": {"min": xyz.min(axis=0).round(2).tolist(), "max": xyz.max(axis=0).round(2).tolist()},
-        "places_in_no_street": int((bundle.place_street < 0).sum()), "streets": sorted(names),
-        "parameters": manifest.parameters, "georeference": manifest.georeference,
-        "encoder": {"sha256": manifest.encoder_sha256, "trained_on": list(Encoder.open(bundle.encoder_bytes()).trained_on)},
-        "calibrated": bundle.calibration is not None, "site": site, "keeps_sums": parts.STATISTICS_FILE in manifest.files,
-        "licence": manifest.licence, "tool_versions": manifest.tool_versions,
+        "places_in_no_street": int((bundle.place_street < 0).sum()),
+        "streets": sorted(names),
+        "parameters": manifest.parameters,
+        "georeference": manifest.georeference,
+        "encoder": {
+            "sha256": manifest.encoder_sha256,
+            "trained_on": list(Encoder.open(bundle.encoder_bytes()).trained_on),
+        },
+        "calibrated": calibration is not None,
+        "site": None if site is None else site.model_dump(),
+        "rig": None if rig is None else rig.model_dump(),
+        "keeps_sums": parts.STATISTICS_FILE in manifest.files,
+        "licence": manifest.licence,
+        "tool_versions": manifest.tool_versions,
         "files": {name: entry.size for name, entry in sorted(manifest.files.items())},
-    }  # fmt: skip
+    }

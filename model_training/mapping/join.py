@@ -24,7 +24,11 @@ _OF_A_DRIVE = (
     "traffic_vote",
     "survey_aligned",
     "expected_lidar_height_m",
+    "survey_position_std_m",
+    "survey_angle_std_deg",
 )
+#: Standard deviations of which the joined map keeps the larger one.
+_WORST = ("survey_position_std_m", "survey_angle_std_deg")
 #: Flags that the joined map keeps only if both maps have them.
 _OF_ALL = ("passes_vote", "traffic_vote", "survey_aligned")
 
@@ -45,25 +49,33 @@ def require_same(a: BundleContent, b: BundleContent, *, names: tuple[str, str]) 
         if first.get(what) != second.get(what):
             raise BundleError(
                 f"{what}: {names[0]} has {first.get(what)!r}, {names[1]} has {second.get(what)!r}; build "
-                f"one of them again with the other's {what}", field=what,
-            )  # fmt: skip
+                f"one of them again with the other's {what}",
+                field=what,
+            )
     if not np.array_equal(a.rows_seen, b.rows_seen):
         count = int((a.rows_seen != b.rows_seen).sum())
         raise BundleError(
             f"rows_seen: {names[0]} and {names[1]} differ in {count} of {len(a.rows_seen)} rows of "
             "the view grid: their LiDARs have different vertical fields of view; give the second "
-            "survey's dataset to `streetfix map update` instead", field="rows_seen",
-        )  # fmt: skip
+            "survey's dataset to `streetfix map update` instead",
+            field="rows_seen",
+        )
 
 
 def _comparable(content: BundleContent) -> dict[str, Any]:
     parameters = {f"parameters.{k}": v for k, v in content.parameters.items() if k not in _OF_A_DRIVE}
     grid = {f"grid.{k}": v for k, v in asdict(content.grid).items()}
     georeference = None if content.georeference is None else dict(content.georeference)
-    return parameters | grid | {
-        "encoder": sha256(content.encoder).hexdigest()[:16], "georeference": georeference, "headings": content.headings,
-        "spacing_m": content.spacing_m,
-    }  # fmt: skip
+    return (
+        parameters
+        | grid
+        | {
+            "encoder": sha256(content.encoder).hexdigest()[:16],
+            "georeference": georeference,
+            "headings": content.headings,
+            "spacing_m": content.spacing_m,
+        }
+    )
 
 
 def joined(a: BundleContent, b: BundleContent, *, newer_streets: bool = False) -> BundleContent:
@@ -86,24 +98,35 @@ def joined(a: BundleContent, b: BundleContent, *, newer_streets: bool = False) -
     counts = len(a.T_map_place), len(fresh.T_map_place)
     heights = a.parameters["lidar_height_m"], b.parameters["lidar_height_m"]
     height_m = float(np.average(heights, weights=counts)) if sum(counts) else heights[0]
-    T_map_place = np.concatenate([
-        _at_height(a.T_map_place, height_m - heights[0]), _at_height(fresh.T_map_place, height_m - heights[1])
-    ])  # fmt: skip
+    T_map_place = np.concatenate(
+        [_at_height(a.T_map_place, height_m - heights[0]), _at_height(fresh.T_map_place, height_m - heights[1])]
+    )
     streets = joined_streets(a.streets, b.streets, newer=newer_streets)
     counted = {
         name: a.parameters.get(name, 0.0) + b.parameters.get(name, 0.0) for name in ("survey_scans", "places_between")
     }
     parameters = {**a.parameters, "lidar_height_m": height_m, **counted}
+    for name in _WORST:
+        stated = [of.parameters[name] for of in (a, b) if name in of.parameters]
+        parameters |= {name: max(stated)} if stated else {}
     for name in _OF_ALL:
         if name not in b.parameters:
             parameters.pop(name, None)
     return replace(
-        a, T_map_place=T_map_place, place_street=streets_of(streets, T_map_place), streets=streets, parameters=parameters,
-        view_place=views_of(len(T_map_place), a.headings), descriptors=np.concatenate([a.descriptors, fresh.descriptors]),
-        view_heading_rad=np.concatenate([a.view_heading_rad, fresh.view_heading_rad]), cloud=None, statistics=None, preview_webp=b"",
+        a,
+        T_map_place=T_map_place,
+        place_street=streets_of(streets, T_map_place),
+        streets=streets,
+        parameters=parameters,
+        view_place=views_of(len(T_map_place), a.headings),
+        descriptors=np.concatenate([a.descriptors, fresh.descriptors]),
+        view_heading_rad=np.concatenate([a.view_heading_rad, fresh.view_heading_rad]),
+        cloud=None,
+        statistics=None,
+        preview_webp=b"",
         calibration=joined_calibration(a.calibration, b.calibration),
         licence="\n".join(dict.fromkeys(text for text in (a.licence, b.licence) if text)),
-    )  # fmt: skip
+    )
 
 
 def standing_apart(
@@ -131,10 +154,13 @@ def of_places(content: BundleContent, keep: NDArray[np.bool_]) -> BundleContent:
     """
     views = keep[content.view_place]
     return replace(
-        content, T_map_place=content.T_map_place[keep], place_street=content.place_street[keep],
-        view_place=views_of(int(keep.sum()), content.headings), view_heading_rad=content.view_heading_rad[views],
+        content,
+        T_map_place=content.T_map_place[keep],
+        place_street=content.place_street[keep],
+        view_place=views_of(int(keep.sum()), content.headings),
+        view_heading_rad=content.view_heading_rad[views],
         descriptors=content.descriptors[views],
-    )  # fmt: skip
+    )
 
 
 def _at_height(T_map_place: NDArray[np.float64], up_m: float) -> NDArray[np.float64]:
@@ -167,7 +193,7 @@ def joined_streets(
                 f"streets: both maps have a street {name!r}, but the two differ; give one of them another id, or the "
                 "same streets.geojson",
                 field="streets.geojson",
-            )  # fmt: skip
+            )
         features[name] = feature
     return {**a, "features": list(features.values())}
 
@@ -175,25 +201,35 @@ def joined_streets(
 def joined_calibration(a: Mapping[str, Any], b: Mapping[str, Any]) -> dict[str, Any]:
     """Join two calibrations with their site checks; the result is uncalibrated if one of them is.
 
+    A correction for a rig stays only if both have the same one. It was learned on one of the maps only.
+
     Args:
         a: content of ``calibration.json``.
         b: content of another one.
 
     Raises:
-        BundleError: they differ in more than their site checks.
+        BundleError: they differ in more than their site checks and corrections for a rig.
     """
     if not a["calibrated"] or not b["calibrated"]:
         return dict(b if a["calibrated"] else a)
-    if json.dumps({**a, "site": None}, sort_keys=True) != json.dumps({**b, "site": None}, sort_keys=True):
+    own = {"site": None, "rig": None}
+    if json.dumps({**a, **own}, sort_keys=True) != json.dumps({**b, **own}, sort_keys=True):
         raise BundleError(
-            "calibration: the maps have different ones; build one of them again with the other's --calibration", field="calibration"
-        )  # fmt: skip
+            "calibration: the maps have different ones; build one of them again with the other's --calibration",
+            field="calibration",
+        )
+    a = {**a, "rig": a.get("rig") if a.get("rig") == b.get("rig") else None}
     sites = [site for site in (a.get("site"), b.get("site")) if site is not None]
     if len(sites) < 2:
         return {**a, "site": sites[0] if sites else None}
     queries = sum(site["queries"] for site in sites)
     error = sum(site["expected_calibration_error"] * site["queries"] for site in sites) / max(1, queries)
-    return {**a, "site": {
-        "offset": min(site["offset"] for site in sites), "queries": queries, "right": sum(site["right"] for site in sites),
-        "expected_calibration_error": error,
-    }}  # fmt: skip
+    return {
+        **a,
+        "site": {
+            "offset": min(site["offset"] for site in sites),
+            "queries": queries,
+            "right": sum(site["right"] for site in sites),
+            "expected_calibration_error": error,
+        },
+    }

@@ -191,9 +191,15 @@ class Vote:
 
     @classmethod
     def of(
-        cls, cloud: VoxelMap, dataset: Dataset, poses: NDArray[np.float64], numbers: NDArray[np.int64], settings: BuildSettings,
-        *, each_scan: bool,
-    ) -> "Vote":  # fmt: skip
+        cls,
+        cloud: VoxelMap,
+        dataset: Dataset,
+        poses: NDArray[np.float64],
+        numbers: NDArray[np.int64],
+        settings: BuildSettings,
+        *,
+        each_scan: bool,
+    ) -> "Vote":
         """Set up a vote.
 
         Args:

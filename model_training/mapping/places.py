@@ -122,8 +122,9 @@ class Drive:
             before = placed
         keys, moments = points.sums()
         return {name: np.stack([each[name] for each in found]) for name in Places.__slots__} | {
-            "keys": keys, "moments": moments
-        }  # fmt: skip
+            "keys": keys,
+            "moments": moments,
+        }
 
     def _added(self, before: PlacedScan, placed: PlacedScan, k: int) -> list[Viewpoint]:
         """Return the viewpoints between the kept scans ``k - 1`` and ``k``, and those beyond them where a traversal ends."""
@@ -138,16 +139,20 @@ class Drive:
     def _encoded(self, viewpoint: Viewpoint, sources: tuple[int, int]) -> Arrays:
         """Return the fields of one place in ``Places``; its descriptors are (headings, D)."""
         turns = fan(self.settings.headings)
-        planes = np.stack([
-            survey_planes(view, sensor_height_m=viewpoint.height_m, rows_seen=self.rows_seen, grid=self.grid)
-            for view in fan_views(viewpoint.points, viewpoint.start_rad + turns, self.grid)
-        ])  # fmt: skip
+        planes = np.stack(
+            [
+                survey_planes(view, sensor_height_m=viewpoint.height_m, rows_seen=self.rows_seen, grid=self.grid)
+                for view in fan_views(viewpoint.points, viewpoint.start_rad + turns, self.grid)
+            ]
+        )
         heading_rad = heading_of_body(viewpoint.T_map_level) + viewpoint.start_rad + turns
         return {
-            "T_map_level": viewpoint.T_map_level, "height_m": np.array(viewpoint.height_m),
-            "heading_rad": (heading_rad + np.pi) % (2 * np.pi) - np.pi, "descriptors": self.encoder.encode(planes, "survey"),
+            "T_map_level": viewpoint.T_map_level,
+            "height_m": np.array(viewpoint.height_m),
+            "heading_rad": (heading_rad + np.pi) % (2 * np.pi) - np.pi,
+            "descriptors": self.encoder.encode(planes, "survey"),
             "sources": np.array(sources, np.int64),
-        }  # fmt: skip
+        }
 
 
 def gathered(chunks: Iterable[Arrays], empty: VoxelMap) -> tuple[Places, VoxelMap]:

@@ -47,9 +47,9 @@ class ResumedStages:
         Args:
             grid: the view grid.
         """
-        return self.work.part(
-            "rows", lambda: {"seen": rows_seen_by(self.dataset, self.kept, grid, self.settings)}
-        )["seen"]  # fmt: skip
+        return self.work.part("rows", lambda: {"seen": rows_seen_by(self.dataset, self.kept, grid, self.settings)})[
+            "seen"
+        ]
 
     def poses(self, given: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return T_map_lidar of all scans (n, 4, 4), aligned if the settings say so.
@@ -61,7 +61,7 @@ class ResumedStages:
             return given
         return self.work.part(
             "poses", lambda: {"aligned": aligned(self.dataset, given, self.kept, report=self.report)}
-        )["aligned"]  # fmt: skip
+        )["aligned"]
 
     def places(self, drive: Drive, empty: VoxelMap, *, apart: Set[int] = frozenset()) -> tuple[Places, VoxelMap]:
         """Return the places of the survey and the voxel map of its points.

@@ -23,13 +23,24 @@ def content_of(bundle: MapBundle) -> BundleContent:
     """
     manifest = bundle.manifest
     return BundleContent(
-        name=manifest.name, grid=bundle.grid, headings=manifest.headings, spacing_m=manifest.spacing_m, rows_seen=bundle.rows_seen,
-        T_map_place=np.array(bundle.T_map_place), place_street=np.array(bundle.place_street), view_place=np.array(bundle.view_place),
-        view_heading_rad=np.array(bundle.view_heading_rad), descriptors=bundle.view_index.vectors(np.arange(len(bundle.views))),
-        encoder=bundle.encoder_bytes(), parameters=dict(manifest.parameters), streets=streets_of_bundle(bundle),
+        name=manifest.name,
+        grid=bundle.grid,
+        headings=manifest.headings,
+        spacing_m=manifest.spacing_m,
+        rows_seen=bundle.rows_seen,
+        T_map_place=np.array(bundle.T_map_place),
+        place_street=np.array(bundle.place_street),
+        view_place=np.array(bundle.view_place),
+        view_heading_rad=np.array(bundle.view_heading_rad),
+        descriptors=bundle.view_index.vectors(np.arange(len(bundle.views))),
+        encoder=bundle.encoder_bytes(),
+        parameters=dict(manifest.parameters),
+        streets=streets_of_bundle(bundle),
         calibration=json.loads((bundle.path / parts.CALIBRATION_FILE).read_bytes()),
-        georeference=manifest.georeference, licence=manifest.licence, tool_versions=manifest.tool_versions,
-    )  # fmt: skip
+        georeference=manifest.georeference,
+        licence=manifest.licence,
+        tool_versions=manifest.tool_versions,
+    )
 
 
 def streets_of_bundle(bundle: MapBundle) -> dict[str, Any] | None:

@@ -98,7 +98,8 @@ def kept_scans(dataset: Dataset, settings: BuildSettings) -> tuple[NDArray[np.fl
     poses = dataset.survey_poses()
     if not len(poses):
         raise DatasetError(
-            f"{dataset.folder}/survey/poses.txt is empty: there is nothing to build a map of", field="survey"
+            f"{dataset.folder}/survey/poses.txt is empty, so no map can be built; import the survey again",
+            field="survey",
         )
     return poses, thinned(poses, settings.spacing_m)
 
@@ -196,6 +197,7 @@ def rows_seen_by(
     if not seen.any():
         raise DatasetError(
             f"{dataset.folder}: the scans have no points between {grid.elevation_bottom_deg:g} and {grid.elevation_top_deg:g} degrees "
-            f"of elevation within {grid.max_range_m:g} m: check units and axes (metres, z up)", field="survey",
-        )  # fmt: skip
+            f"of elevation within {grid.max_range_m:g} m: check units and axes (metres, z up)",
+            field="survey",
+        )
     return seen

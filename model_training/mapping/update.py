@@ -77,9 +77,14 @@ def update_map(
     encoder = Encoder.open(bundle.encoder_bytes(), threads=threads)
     poses, kept = kept_scans(dataset, settings)
     require_poses_within(empty_voxels_of(bundle), poses, dataset)
-    key = key_of(dataset, encoder.sha256, settings, threads=threads, map=bundle.manifest.version, replaced=_told(
-        replace_covered, replace_area
-    ))  # fmt: skip
+    key = key_of(
+        dataset,
+        encoder.sha256,
+        settings,
+        threads=threads,
+        map=bundle.manifest.version,
+        replaced=_replaced_key(replace_covered, replace_area),
+    )
     with work_beside(out, key) as work:
         stages = ResumedStages(work, dataset, kept, settings, report)
         _require_rows(stages.rows_seen(bundle.grid), bundle, dataset)
@@ -88,8 +93,8 @@ def update_map(
         cloud = voxels_of(bundle)
         places, fresh = stages.places(drive, VoxelMap(cloud.voxel_m, cloud.origin))
         if settings.traffic_vote:
-            gone = stages.dynamic_voxels(fresh, poses, each_scan=True)
-            fresh.keep(~np.isin(fresh.sums()[0], gone))
+            dynamic = stages.dynamic_voxels(fresh, poses, each_scan=True)
+            fresh.keep(~np.isin(fresh.sums()[0], dynamic))
         content = content_of(bundle)
         if replace_covered or area is not None:
             area = area or covered_by(fresh.means(), places.T_map_level[:, :3, 3])
@@ -97,8 +102,8 @@ def update_map(
         earlier = cloud.sums()[0].copy()
         cloud.add_sums(*fresh.sums())
         if passes_vote:
-            gone = stages.dynamic_voxels(cloud, poses, each_scan=False, earlier=earlier)
-            cloud.keep(~np.isin(cloud.sums()[0], gone))
+            dynamic = stages.dynamic_voxels(cloud, poses, each_scan=False, earlier=earlier)
+            cloud.keep(~np.isin(cloud.sums()[0], dynamic))
         whole = joined(content, _content(drive, places, content), newer_streets=area is not None)
         report("writing", 0, 2)
         whole = with_cloud(replace(whole, tool_versions=tool_versions()), cloud)
@@ -108,7 +113,7 @@ def update_map(
         return manifest
 
 
-def _told(replace_covered: bool, replace_area: Path | None) -> str:
+def _replaced_key(replace_covered: bool, replace_area: Path | None) -> str:
     return str(replace_covered) if replace_area is None else replace_area.read_text()
 
 
@@ -116,23 +121,24 @@ def _require_frame(dataset: Dataset, bundle: MapBundle) -> None:
     of_map, of_drive = bundle.manifest.georeference, dataset.description.georeference
     if of_map != of_drive:
         raise DatasetError(
-            f"{dataset.folder}: its frame lies at {of_drive or 'no known place'}, that of the map {bundle.path} at "
-            f"{of_map or 'no known place'}; bring the drive's poses into the map's frame and give it the map's georeference",
+            f"{dataset.folder}: the georeference of the dataset is {of_drive or 'missing'}, that of the map {bundle.path} is "
+            f"{of_map or 'missing'}; transform the poses of the survey into the map frame and use the georeference of the map",
             field="georeference",
-        )  # fmt: skip
+        )
 
 
 def _require_rows(rows_seen: np.ndarray, bundle: MapBundle, dataset: Dataset) -> None:
     """Refuse a survey whose LiDAR misses more than a tenth of the rows that the map uses.
 
-    A few rows at the rim are covered by chance or not. With more missing rows, the views would look like those of another sensor.
+    A few rows at the upper and lower edge depend on chance. With more missing rows, the views would look like those of another sensor.
     """
     missing = int((bundle.rows_seen & ~rows_seen).sum())
     if missing > 0.1 * bundle.rows_seen.sum():
         raise DatasetError(
-            f"{dataset.folder}: its LiDAR does not see {missing} of the {int(bundle.rows_seen.sum())} rows of the view grid that the map's "
-            "does; survey with one that looks as far up and down, or build a map of its own", field="survey",
-        )  # fmt: skip
+            f"{dataset.folder}: the LiDAR of the survey does not see {missing} of the {int(bundle.rows_seen.sum())} rows of the view grid "
+            "that the map uses; use a LiDAR with at least the same vertical field of view, or build a separate map (build-map)",
+            field="survey",
+        )
 
 
 def _without(
@@ -141,9 +147,10 @@ def _without(
     """Return the map without its places in the area, and remove its voxels there from ``cloud``."""
     if not area(places.T_map_level[:, :2, 3]).any():
         raise DatasetError(
-            f"{polygon}: none of the new drive's places lies in the polygon, so nothing would fill it; give one around where it drove, "
-            "in metres of the map frame", field="area",
-        )  # fmt: skip
+            f"{polygon}: no place of the new survey lies in the polygon, so the polygon would become empty; "
+            "draw a polygon around the new survey, in metres of the map frame",
+            field="area",
+        )
     cloud.keep(~area(cloud.means()[:, :2]))
     return of_places(content, ~area(content.T_map_place[:, :2, 3]))
 
@@ -154,11 +161,19 @@ def _content(drive: Drive, places: Places, old: BundleContent) -> BundleContent:
     T_map_place = places.at_height(lidar_height_m)
     voted = {"passes_vote": 1.0} if drive.settings.passes_vote else {}
     return replace(
-        old, T_map_place=T_map_place, place_street=np.full(len(T_map_place), -1, np.int32), streets=drive.dataset.streets(),
-        view_place=views_of(len(T_map_place), old.headings), view_heading_rad=places.heading_rad.ravel(), descriptors=places.descriptors,
+        old,
+        T_map_place=T_map_place,
+        place_street=np.full(len(T_map_place), -1, np.int32),
+        streets=drive.dataset.streets(),
+        view_place=views_of(len(T_map_place), old.headings),
+        view_heading_rad=places.heading_rad.ravel(),
+        descriptors=places.descriptors,
         parameters={
-            **{name: value for name, value in old.parameters.items() if name != "passes_vote"}, "lidar_height_m": lidar_height_m,
-            "survey_scans": float(len(drive.poses)), "places_between": float(places.between), **voted,
+            **{name: value for name, value in old.parameters.items() if name != "passes_vote"},
+            "lidar_height_m": lidar_height_m,
+            "survey_scans": float(len(drive.poses)),
+            "places_between": float(places.between),
+            **voted,
         },
         calibration={**old.calibration, "site": None} if old.calibration["calibrated"] else old.calibration,
-    )  # fmt: skip
+    )

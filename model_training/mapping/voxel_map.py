@@ -98,8 +98,9 @@ class VoxelMap:
             raise DatasetError(
                 f"{what(farthest)} is {away[farthest] / 1000:,.0f} km from the middle of the map, but "
                 f"a map with voxels of {self.voxel_m:g} m reaches {self.reach_m / 1000:.0f} km; "
-                "transform all poses into one frame (are some UTM?), or build a map of each area", field="poses",
-            )  # fmt: skip
+                "transform all poses into one frame (are some UTM?), or build a map of each area",
+                field="poses",
+            )
 
     def add(self, points_map: NDArray[np.float64], intensity: NDArray[np.floating[Any]] | None = None) -> None:
         """Add points.
@@ -318,9 +319,16 @@ def _shifted(moments: NDArray[np.float64], shift: NDArray[np.float64]) -> NDArra
     x, y, z = s.T
     n0 = moments[:, 0]
     moved[:, _SECOND] += np.stack(
-        [2 * a * x + n0 * a * a, a * y + b * x + n0 * a * b, a * z + c * x + n0 * a * c,
-         2 * b * y + n0 * b * b, b * z + c * y + n0 * b * c, 2 * c * z + n0 * c * c], axis=1
-    )  # fmt: skip
+        [
+            2 * a * x + n0 * a * a,
+            a * y + b * x + n0 * a * b,
+            a * z + c * x + n0 * a * c,
+            2 * b * y + n0 * b * b,
+            b * z + c * y + n0 * b * c,
+            2 * c * z + n0 * c * c,
+        ],
+        axis=1,
+    )
     return moved
 
 

@@ -110,8 +110,9 @@ def work_beside(out: Path, key: str) -> Iterator[Work]:
     except OSError as error:
         raise BundleError(
             f"{folder}: the intermediate results of the build cannot be stored ({error.strerror}); free "
-            "disk space or choose another folder", field="out"
-        ) from error  # fmt: skip
+            "disk space or choose another folder",
+            field="out",
+        ) from error
     with lock:
         for path in folder.iterdir():
             if path.name != _LOCK and not path.name.endswith(f"-{key}.npz"):
@@ -158,15 +159,22 @@ def key_of(
     """
     folder = dataset.folder / "survey" / "scans"
     with reading(folder):
-        scans = sorted(
-            (scan.name, scan.stat().st_size, scan.stat().st_mtime_ns) for scan in os.scandir(folder)
-        ) if folder.is_dir() else []  # fmt: skip
+        scans = (
+            sorted((scan.name, scan.stat().st_size, scan.stat().st_mtime_ns) for scan in os.scandir(folder))
+            if folder.is_dir()
+            else []
+        )
     chosen = {name: value for name, value in asdict(settings).items() if name not in _NOT_IN_PARTS}
     made_of = {
         "dataset": [type(dataset).__qualname__, dataset.description.model_dump(mode="json"), scans],
         "poses": hashlib.sha256(dataset.survey_poses().tobytes()).hexdigest(),
-        "encoder": encoder_sha256, "settings": chosen, "threads": threads, "held_out": held_out, "code": _code(), "more": more,
-    }  # fmt: skip
+        "encoder": encoder_sha256,
+        "settings": chosen,
+        "threads": threads,
+        "held_out": held_out,
+        "code": _code(),
+        "more": more,
+    }
     return hashlib.sha256(json.dumps(made_of, sort_keys=True).encode()).hexdigest()[:24]
 
 
@@ -231,5 +239,6 @@ def _write(path: Path, arrays: Arrays) -> None:
     except OSError as error:
         raise BundleError(
             f"{path.parent}: the intermediate results of the build cannot be stored ({error.strerror}); "
-            "free disk space or choose another folder", field="out"
-        ) from error  # fmt: skip
+            "free disk space or choose another folder",
+            field="out",
+        ) from error

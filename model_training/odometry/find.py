@@ -58,9 +58,12 @@ def find_trajectory(
     total = recording.count()
     with tempfile.TemporaryDirectory(prefix="streetfix-odometry-") as folder:
         drive = drive_of(
-            posed(scans_of(recording)), encoder, Path(folder), expected_height_m=expected_height_m,
+            posed(scans_of(recording)),
+            encoder,
+            Path(folder),
+            expected_height_m=expected_height_m,
             report=lambda done: report("odometry", done, max(done, total)),
-        )  # fmt: skip
+        )
         if not len(drive.stamps_s):
             raise DatasetError("no scan is usable, so odometry is not possible", field="scans")
         name = "odometry (KISS-ICP)"

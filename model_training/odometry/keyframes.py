@@ -112,10 +112,17 @@ def _keyframe(scan: PosedScan, index: int, travelled_m: float, encoder: Encoder,
     grid = ViewGrid(rows=encoder.rows, columns=encoder.columns)
     panorama = panorama_from_points(levelled, grid)
     every_row = np.ones(grid.rows, np.bool_)  # one LiDAR recorded both sides of a comparison
-    planes = np.stack([
-        survey_planes(view_from_panorama(panorama, start_rad + turn, grid), sensor_height_m=level.height_m, rows_seen=every_row, grid=grid)
-        for turn in fan(HEADINGS)
-    ])  # fmt: skip
+    planes = np.stack(
+        [
+            survey_planes(
+                view_from_panorama(panorama, start_rad + turn, grid),
+                sensor_height_m=level.height_m,
+                rows_seen=every_row,
+                grid=grid,
+            )
+            for turn in fan(HEADINGS)
+        ]
+    )
     descriptors = encoder.encode(planes, "survey")
     return Keyframe(index, scan.stamp_s, scan.T_first_lidar, travelled_m, level, start_rad, descriptors)
 

@@ -45,8 +45,12 @@ def write_comparison_page(
         Section("errors", "Errors", _errors(found)),
         Section("curves", "Curves", f'<div class="pair">{_curves(found)}</div>'),
         Section("lost", f"Lost: {len(found.lost)}", _changed(found.lost, first, found, dataset, plan)),
-        Section("gained", f"Gained: {len(found.gained)}", _changed(found.gained, first, found, dataset, plan, has_plan=bool(found.lost))),
-    ]  # fmt: skip
+        Section(
+            "gained",
+            f"Gained: {len(found.gained)}",
+            _changed(found.gained, first, found, dataset, plan, has_plan=bool(found.lost)),
+        ),
+    ]
     title = f"{first.settings.dataset.name}: A against B"
     path = folder / PAGE
     write_page(path, page(title, _lead(first, second, found), sections))
@@ -84,9 +88,15 @@ def row_of(label: str, each: PairedShares) -> list[str]:
     """
     low, high = each.interval
     return [
-        label, f"{each.first:.1%}", f"{each.second:.1%}", f"{100 * each.difference:+.1f}", f"{100 * low:+.1f} to {100 * high:+.1f}",
-        str(each.only_first), str(each.only_second), p_text(each.p),
-    ]  # fmt: skip
+        label,
+        f"{each.first:.1%}",
+        f"{each.second:.1%}",
+        f"{100 * each.difference:+.1f}",
+        f"{100 * low:+.1f} to {100 * high:+.1f}",
+        str(each.only_first),
+        str(each.only_second),
+        p_text(each.p),
+    ]
 
 
 HEAD = ("", "A", "B", "B - A", "95 % interval", "only A", "only B", "p")
@@ -97,8 +107,9 @@ def _shares(found: Comparison) -> str:
         "Paired differences in percentage points over all queries: Newcombe's interval (method 10), McNemar's exact "
         "p. Forced: whatever the status. With many measures some differ by chance: without any true difference, one "
         "in twenty has p below 0.05.",
-        HEAD, [row_of(escape(LABELS[name]), each) for name, each in found.shares.items()],
-    )  # fmt: skip
+        HEAD,
+        [row_of(escape(LABELS[name]), each) for name, each in found.shares.items()],
+    )
     if len(found.sets) == 1:
         return whole
     return whole + table(
@@ -120,8 +131,9 @@ def _errors(found: Comparison) -> str:
         f"Errors of B less those of A, over the {each.count} queries that both answered, accepted or not "
         f"(median of A {each.first_median_m:.3f} m, of B {each.second_median_m:.3f} m); intervals by paired bootstrap. "
         f"Wilcoxon's signed-rank p {p_text(each.p)}.",
-        ("", "B - A", "95 % interval"), rows,
-    )  # fmt: skip
+        ("", "B - A", "95 % interval"),
+        rows,
+    )
 
 
 def _metres(interval: tuple[float, float]) -> str:

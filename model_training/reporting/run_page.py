@@ -25,15 +25,22 @@ from service.maps.reader import MapBundle
 PAGE = "index.html"
 WORST = 20
 _SHARES = (
-    ("localized", "answered"), ("within_0_5_m", "within 0.5 m"), ("within_1_m", "within 1 m"), ("within_5_m", "within 5 m"),
-    ("street_accuracy", "street right"), ("recall_at_1_5m", "R@1 at 5 m"), ("recall_at_5_5m", "R@5 at 5 m"),
+    ("localized", "answered"),
+    ("within_0_5_m", "within 0.5 m"),
+    ("within_1_m", "within 1 m"),
+    ("within_5_m", "within 5 m"),
+    ("street_accuracy", "street right"),
+    ("recall_at_1_5m", "R@1 at 5 m"),
+    ("recall_at_5_5m", "R@5 at 5 m"),
     ("recall_at_10_5m", "R@10 at 5 m"),
-)  # fmt: skip
+)
 _NUMBERS = (
-    ("median_distance_error_m", "median error", "{:.2f} m"), ("mean_distance_error_m", "mean error", "{:.2f} m"),
-    ("p95_distance_error_m", "95th percentile", "{:.2f} m"), ("median_heading_error_deg", "median heading error", "{:.2f}°"),
+    ("median_distance_error_m", "median error", "{:.2f} m"),
+    ("mean_distance_error_m", "mean error", "{:.2f} m"),
+    ("p95_distance_error_m", "95th percentile", "{:.2f} m"),
+    ("median_heading_error_deg", "median heading error", "{:.2f}°"),
     ("ms_per_query", "time per query", "{:.0f} ms"),
-)  # fmt: skip
+)
 
 
 def write_run_page(run: SavedRun, bundle: MapBundle, dataset: Dataset, figures: dict[str, Any]) -> Path:
@@ -89,8 +96,13 @@ def _figures(figures: dict[str, Any]) -> str:
         [escape(label), *("-" if values.get(key) is None else form.format(values[key]) for values in columns.values())]
         for key, label, form in _NUMBERS
     ]
-    head = ["", *(f'{escape(name)}<span class="ci">{values["queries"]} queries, {escape(values["split"].replace("_", " "))}</span>'
-                  for name, values in columns.items())]  # fmt: skip
+    head = [
+        "",
+        *(
+            f'{escape(name)}<span class="ci">{values["queries"]} queries, {escape(values["split"].replace("_", " "))}</span>'
+            for name, values in columns.items()
+        ),
+    ]
     caption = (
         "Shares are over all queries, with 95 % intervals; a query without an answer counts as wrong. Distances are "
         "over accepted answers."
@@ -112,19 +124,26 @@ def _share(values: dict[str, Any], key: str) -> str:
 def _conditions(run: SavedRun, figures: dict[str, Any]) -> str:
     sets = figures["sets"]
     rows = [
-        [f"{k}. {escape(each.name)}", escape(each.condition or "not known"), escape(each.split.replace("_", " ")),
-         *(_share(sets[each.name], key) for key in ("localized", "within_1_m", "recall_at_1_5m"))]
+        [
+            f"{k}. {escape(each.name)}",
+            escape(each.condition or "not known"),
+            escape(each.split.replace("_", " ")),
+            *(_share(sets[each.name], key) for key in ("localized", "within_1_m", "recall_at_1_5m")),
+        ]
         for k, each in enumerate(run.settings.sets, 1)
-    ]  # fmt: skip
+    ]
     drawn = [
         figure(
             side_by_side({name: (values[key], *values["ci95"][key]) for name, values in sets.items()}, label),
             f"{label}, with 95 % intervals.",
         )
         for key, label in (("within_1_m", "within 1 m"), ("recall_at_1_5m", "R@1 at 5 m"))
-    ]  # fmt: skip
-    return table("Each query set with weather and light, and how its queries relate to the survey.",
-                 ["set", "condition", "split", "answered", "within 1 m", "R@1 at 5 m"], rows) + _pair(drawn)  # fmt: skip
+    ]
+    return table(
+        "Each query set with weather and light, and how its queries relate to the survey.",
+        ["set", "condition", "split", "answered", "within 1 m", "R@1 at 5 m"],
+        rows,
+    ) + _pair(drawn)
 
 
 def _errors(runs: dict[str, Predictions], everything: Predictions) -> str:
@@ -192,9 +211,11 @@ def _confusion(confusion: dict[str, Any]) -> str:
         if not sum(row):
             continue
         cells = "".join(
-            f'<td{"" if column == number else " class=wrong"} style="--share:{count / sum(row):.2f}">{count}</td>' if count else "<td></td>"
+            f'<td{"" if column == number else " class=wrong"} style="--share:{count / sum(row):.2f}">{count}</td>'
+            if count
+            else "<td></td>"
             for column, count in enumerate(row)
-        )  # fmt: skip
+        )
         body.append(f'<tr><th scope="row">{escape(name)} ({number + 1})</th>{cells}</tr>')
     return (
         '<div class="scroll"><table class="confusion"><caption>Rows are true streets, columns are answered streets, by number. The last '

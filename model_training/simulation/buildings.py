@@ -181,8 +181,13 @@ def _facade(
     builder.box(at(door, style.relief * 0.2, ground), (1.1, style.relief * 0.4, 2.1), yaw, door_colour, Material.MATTE)
     builder.box(at(door, 0.6, ground + 2.3), (rng.uniform(1.2, 2.5), 1.2, 0.2), yaw, wall * 0.8, Material.MATTE)
     if rng.random() < 0.4:
-        builder.box(at(door, 0.6, ground - 0.5), (rng.uniform(1.5, 3), 1.2, 0.5 + rng.uniform(0.2, 0.6)), yaw,
-                    np.array([0.5, 0.5, 0.48]), Material.MATTE)  # fmt: skip
+        builder.box(
+            at(door, 0.6, ground - 0.5),
+            (rng.uniform(1.5, 3), 1.2, 0.5 + rng.uniform(0.2, 0.6)),
+            yaw,
+            np.array([0.5, 0.5, 0.48]),
+            Material.MATTE,
+        )
     if rng.random() < 0.35 * lively * 2 and along > 6:
         colour = AWNINGS[rng.integers(len(AWNINGS))]
         for _ in range(int(rng.integers(1, 4))):
@@ -221,5 +226,10 @@ def _pitched_roof(builder: MeshBuilder, plan: Footprint, *, hipped: bool, rng: n
     builder.triangles(turned[faces], ROOFS[rng.integers(len(ROOFS))] * rng.uniform(0.8, 1.2), Material.MATTE)
     if rng.random() < 0.6:
         at = plan.centre[:2] + _turned(rng.uniform(-0.3, 0.3, 2) * (plan.width, plan.depth), plan.yaw)
-        builder.box(np.array([*at, plan.centre[2] + plan.height]), (0.7, 0.7, rise + rng.uniform(0.3, 1)), plan.yaw,
-                    np.array([0.45, 0.28, 0.22]), Material.BRICK)  # fmt: skip
+        builder.box(
+            np.array([*at, plan.centre[2] + plan.height]),
+            (0.7, 0.7, rise + rng.uniform(0.3, 1)),
+            plan.yaw,
+            np.array([0.45, 0.28, 0.22]),
+            Material.BRICK,
+        )

@@ -98,9 +98,12 @@ def query_candidates(city: City, plan: SimulationPlan, query: QueryPlan, survey:
     """
     rng = np.random.default_rng([plan.seed, 22, query.traversal, 1 if query.on_track else 0])
     drive = QueryDrive(
-        aside_m=query.aside_m, heading_deg=query.heading_deg, height_m=plan.camera_height_m, turn_deg=query.turn_deg,
+        aside_m=query.aside_m,
+        heading_deg=query.heading_deg,
+        height_m=plan.camera_height_m,
+        turn_deg=query.turn_deg,
         pitch_deg=query.pitch_deg,
-    )  # fmt: skip
+    )
     if query.on_track:
         order = rng.permutation(len(survey.T_map_lidar))
         return np.array([_camera_on(survey.T_map_lidar[k], plan, query) for k in order])

@@ -80,8 +80,10 @@ def exposed(
     picture = to_srgb(linear, gain) if model.response == "tone_mapped" else _in_proportion(linear, gain)
     sigma = model.noise + model.noise_per_gain * min(gain, 40.0)
     picture += rng.standard_normal(linear.shape[:2], dtype=np.float32)[..., None] * np.float32(sigma)
-    picture += cv2.resize(rng.standard_normal((linear.shape[0] // 2, linear.shape[1] // 2, 3), dtype=np.float32),
-                          (linear.shape[1], linear.shape[0])) * np.float32(0.5 * sigma)  # fmt: skip
+    picture += cv2.resize(
+        rng.standard_normal((linear.shape[0] // 2, linear.shape[1] // 2, 3), dtype=np.float32),
+        (linear.shape[1], linear.shape[0]),
+    ) * np.float32(0.5 * sigma)
     if condition.streaks > 0:
         _particles(picture, condition, rng)
     return np.clip(np.rint(picture), 0, 255).astype(np.uint8)

@@ -56,9 +56,10 @@ class LidarModel:
 _HDL_64 = tuple(2.0 - k / 3 for k in range(32)) + tuple(-8.83 - k / 2 for k in range(32))
 #: Beams of the Pandar64: dense near the horizon, sparse above and below it (Hesai, Pandar64 manual; rounded to 0.01 degrees).
 _PANDAR_64 = (
-    (14.88, 11.03, 8.06, 5.06, 3.04) + tuple(2.03 - k * 8.09 / 48 for k in range(49))
+    (14.88, 11.03, 8.06, 5.06, 3.04)
+    + tuple(2.03 - k * 8.09 / 48 for k in range(49))
     + (-7.06, -8.06, -9.06, -9.89, -11.03, -12.01, -12.97, -13.93, -18.89, -24.9)
-)  # fmt: skip
+)
 
 
 def _with_beams(name: str, beams_deg: tuple[float, ...]) -> LidarModel:

@@ -141,8 +141,9 @@ class QueryPlan(_Model):
         if self.stereo_parameters != StereoParameters() and not self.matched():
             raise DatasetError(
                 f"stereo_parameters: this option has no effect with {self.name!r}, which "
-                f"matches no pairs; use a depth of {', '.join(STEREOS)}", field="stereo_parameters",
-            )  # fmt: skip
+                f"matches no pairs; use a depth of {', '.join(STEREOS)}",
+                field="stereo_parameters",
+            )
         if self.followed is not None and self.blocked > 0:
             raise DatasetError(
                 f"followed: --blocked and --followed exclude each other ({self.name!r} has both); omit one",
@@ -249,7 +250,8 @@ class SimulationPlan(_Model):
             raise DatasetError(
                 f"depth: matched pairs ({', '.join(STEREOS)}) and depth drawn by a model "
                 f"({', '.join(DEPTHS)}) cannot be in one dataset, because its camera has one baseline "
-                "or none; simulate two datasets", field="depth",
-            )  # fmt: skip
+                "or none; simulate two datasets",
+                field="depth",
+            )
         if len({query.stereo_parameters for query in self.queries}) > 1:
             raise DatasetError("stereo_parameters: the drives differ; a dataset has one rig", field="stereo_parameters")

@@ -78,9 +78,13 @@ class Light:
         f = np.float32
         return Light(
             np.array([np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)]),
-            sun.astype(f), (0.75 * (0.5 * zenith + 0.5 * horizon)).astype(f), zenith.astype(f), horizon.astype(f),
-            float(rng.uniform(0.1, 0.8)), condition.extinction_per_m + 1.0 / 2500.0,
-        )  # fmt: skip
+            sun.astype(f),
+            (0.75 * (0.5 * zenith + 0.5 * horizon)).astype(f),
+            zenith.astype(f),
+            horizon.astype(f),
+            float(rng.uniform(0.1, 0.8)),
+            condition.extinction_per_m + 1.0 / 2500.0,
+        )
 
 
 def hashed(cells: NDArray[np.int32]) -> NDArray[np.float32]:
@@ -180,10 +184,16 @@ def shade(
         ahead, found = rays[part], np.empty((len(some.primitive), 3), np.float32)
         found[missed] = _sky(ahead.take(missed, axis=0), light, condition)
         found[met] = _surfaces(
-            scene, ground, origin, ahead.take(met, axis=0),
+            scene,
+            ground,
+            origin,
+            ahead.take(met, axis=0),
             Hits(some.distance.take(met), some.primitive.take(met), some.normal.take(met, axis=0)),
-            light, condition, forward, None if lit is None else lit[part].take(met),
-        )  # fmt: skip
+            light,
+            condition,
+            forward,
+            None if lit is None else lit[part].take(met),
+        )
         colour[part] = found
     return colour
 

@@ -24,6 +24,7 @@ from model_training.datasets.dataset import (
     DepthSpec,
     LidarSensor,
     Sensors,
+    SurveyAccuracy,
     query_folder,
     scan_path,
     write_description,
@@ -177,9 +178,16 @@ def _one_scan(number: int) -> int:
         station = job.survey.stations[number]
         ahead = _vehicle_ahead(job, T[:2, 3], station.heading, station.travelled, 0, survey.followed)
     points = scan(
-        job.scene, job.city.ground, plan.lidar_parameters.on(plan.lidar), job.rays, T, CONDITIONS[plan.survey_condition],
-        np.random.default_rng([plan.seed, 31, number]), survey=survey, ahead=ahead,
-    )  # fmt: skip
+        job.scene,
+        job.city.ground,
+        plan.lidar_parameters.on(plan.lidar),
+        job.rays,
+        T,
+        CONDITIONS[plan.survey_condition],
+        np.random.default_rng([plan.seed, 31, number]),
+        survey=survey,
+        ahead=ahead,
+    )
     _write(scan_path(job.out, number), points.tobytes())
     return number
 
@@ -203,9 +211,11 @@ def _queries(
     camera = plan.camera.pinhole()
     rays, z_of_ray = unit_rays(camera)
     light = Light.of(
-        CONDITIONS[query.condition], np.random.default_rng([plan.seed, 32, query.traversal]),
-        elevation_deg=query.sun_elevation_deg, azimuth_deg=query.sun_azimuth_deg,
-    )  # fmt: skip
+        CONDITIONS[query.condition],
+        np.random.default_rng([plan.seed, 32, query.traversal]),
+        elevation_deg=query.sun_elevation_deg,
+        azimuth_deg=query.sun_azimuth_deg,
+    )
     scene = Scene(joined([city.static, city.occupants(query.traversal, parked_changed=query.parked_changed)]))
     job = _Job(
         plan,
@@ -311,8 +321,20 @@ def _one_pair(number: int) -> int:
     camera, light, rays, z_of_ray = job.camera, job.light, job.rays, job.z_of_ray
 
     def taken(T_map_eye: NDArray[np.float64], rng: np.random.Generator) -> Picture:
-        return take(job.scene, job.city.ground, camera, T_map_eye, light, condition, query.rgb_model(), rng,
-                    rays_camera=rays, z_of_ray=z_of_ray, blocker=blocker, metering=metering)  # fmt: skip
+        return take(
+            job.scene,
+            job.city.ground,
+            camera,
+            T_map_eye,
+            light,
+            condition,
+            query.rgb_model(),
+            rng,
+            rays_camera=rays,
+            z_of_ray=z_of_ray,
+            blocker=blocker,
+            metering=metering,
+        )
 
     picture = taken(T, rng)
     encoded = cv2.imencode(".jpg", picture.rgb[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 90])[1].tobytes()
@@ -351,6 +373,7 @@ def _streets(city: City, out: Path) -> None:
 
 def _description(plan: SimulationPlan) -> DatasetDescription:
     lidar, camera = plan.lidar_parameters.on(plan.lidar), plan.camera.pinhole()
+    survey = plan.survey_parameters.model()
     focal_baseline = plan.focal_baseline_px_m()
     baseline_m = None if focal_baseline is None else focal_baseline / camera.fx
     return DatasetDescription(
@@ -359,17 +382,32 @@ def _description(plan: SimulationPlan) -> DatasetDescription:
         sensors=Sensors(
             lidars=[
                 LidarSensor(
-                    name=lidar.name, channels=lidar.channels, top_deg=lidar.top_deg, bottom_deg=lidar.bottom_deg,
+                    name=lidar.name,
+                    channels=lidar.channels,
+                    top_deg=lidar.top_deg,
+                    bottom_deg=lidar.bottom_deg,
                     max_range_m=lidar.max_range_m,
                 )
             ],
             cameras=[
                 CameraSensor(
-                    name="front", width=camera.width, height=camera.height, fx=camera.fx, fy=camera.fy, cx=camera.cx, cy=camera.cy,
+                    name="front",
+                    width=camera.width,
+                    height=camera.height,
+                    fx=camera.fx,
+                    fy=camera.fy,
+                    cx=camera.cx,
+                    cy=camera.cy,
                     depth=DepthSpec(scale_m=DEPTH_SCALE_M, kind="z", max_range_m=None, baseline_m=baseline_m),
                 )
             ],
         ),
-        conditions={"survey": plan.survey_condition, "queries": {query.name: query.condition for query in plan.queries}},
+        conditions={
+            "survey": plan.survey_condition,
+            "queries": {query.name: query.condition for query in plan.queries},
+        },
         seed=plan.seed,
-    )  # fmt: skip
+        survey_accuracy=SurveyAccuracy(position_std_m=survey.position_m, angle_std_deg=survey.angle_deg)
+        if plan.survey_error
+        else SurveyAccuracy(position_std_m=0.0, angle_std_deg=0.0),
+    )

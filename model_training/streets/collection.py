@@ -65,15 +65,21 @@ def collection_of(streets: Iterable[NamedStreet]) -> StreetCollection:
             continue
         identity = street.id or _free(_id_from(street), taken)
         taken.add(identity)
-        features.append({
-            "type": "Feature",
-            "properties": {
-                "id": identity, "street": street.street, "section": street.section, "name": street.name,
-                "class_index": len(features),
-            },
-            "geometry": {"type": "Polygon", "coordinates": coordinates[0]} if len(coordinates) == 1
-            else {"type": "MultiPolygon", "coordinates": coordinates},
-        })  # fmt: skip
+        features.append(
+            {
+                "type": "Feature",
+                "properties": {
+                    "id": identity,
+                    "street": street.street,
+                    "section": street.section,
+                    "name": street.name,
+                    "class_index": len(features),
+                },
+                "geometry": {"type": "Polygon", "coordinates": coordinates[0]}
+                if len(coordinates) == 1
+                else {"type": "MultiPolygon", "coordinates": coordinates},
+            }
+        )
     if not features:
         raise DatasetError(
             f"no street covers any area ({'; '.join(dropped[:5])}); if the coordinates are degrees, pass --frame wgs84",

@@ -200,6 +200,11 @@ def _street(group: list[tuple[_Naming, list[BaseGeometry], float]]) -> NamedStre
     polygons = [part for _, parts, _ in group for part in parts if isinstance(part, shapely.Polygon)]
     along = corridor([line for line, _ in lines], [width for _, width in lines])
     return NamedStreet(
-        street=naming.street, name=naming.name, surface=shapely.union_all([*polygons, along]),
-        lines=tuple(line for line, _ in lines), section=naming.section, id=naming.id, divisible=naming.section is None,
-    )  # fmt: skip
+        street=naming.street,
+        name=naming.name,
+        surface=shapely.union_all([*polygons, along]),
+        lines=tuple(line for line, _ in lines),
+        section=naming.section,
+        id=naming.id,
+        divisible=naming.section is None,
+    )

@@ -115,11 +115,15 @@ def read_opendrive(path: Path, *, lanes: Lanes = "all", frame: MapFrame | None =
     through, junctions = junction_streets(network.roads, network.junctions, {r.id: r.name for r in roads if r.name})
     streets = [
         NamedStreet(
-            street=name, name=name, lines=tuple(road.centre for road in of_name[name]),
-            surface=shapely.union_all([*(road.surface for road in of_name[name]), *through.get(name, ())], grid_size=GRID_M),
+            street=name,
+            name=name,
+            lines=tuple(road.centre for road in of_name[name]),
+            surface=shapely.union_all(
+                [*(road.surface for road in of_name[name]), *through.get(name, ())], grid_size=GRID_M
+            ),
         )
         for name in sorted(of_name, key=in_natural_order)
-    ]  # fmt: skip
+    ]
     placed = tuple(_in_map(street, network, frame, path) for street in (*streets, *junctions))
     unnamed = sum(not road.name for road in roads)
     return StreetSource(placed, unnamed, tuple(dropped))
@@ -155,6 +159,9 @@ def _in_map(street: NamedStreet, network: RoadNetwork, frame: MapFrame | None, p
         return points
 
     return NamedStreet(
-        street=street.street, name=street.name, surface=shapely.transform(street.surface, placed),
-        lines=tuple(shapely.transform(line, placed) for line in street.lines), divisible=street.divisible,
-    )  # fmt: skip
+        street=street.street,
+        name=street.name,
+        surface=shapely.transform(street.surface, placed),
+        lines=tuple(shapely.transform(line, placed) for line in street.lines),
+        divisible=street.divisible,
+    )

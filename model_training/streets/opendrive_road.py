@@ -112,9 +112,13 @@ def read_road(element: Element, lanes: Lanes, path: Path) -> Road:
             f"{where}: its planView or lanes do not form a surface: {error}", field="planView"
         ) from error
     return Road(
-        identity, (element.get("name") or "").strip(), None if junction in ("-1", "") else junction, tuple(linked),
-        surface, centre,
-    )  # fmt: skip
+        identity,
+        (element.get("name") or "").strip(),
+        None if junction in ("-1", "") else junction,
+        tuple(linked),
+        surface,
+        centre,
+    )
 
 
 def road_shape(road: Element, where: str) -> RoadShape:
@@ -141,9 +145,11 @@ def road_shape(road: Element, where: str) -> RoadShape:
         )
     sections = [_section(element, where) for element in road.findall("lanes/laneSection")]
     return RoadShape(
-        length, tuple(drawn), _records(road.findall("lanes/laneOffset"), "s", where),
+        length,
+        tuple(drawn),
+        _records(road.findall("lanes/laneOffset"), "s", where),
         tuple(sorted(sections, key=lambda each: each.s)),
-    )  # fmt: skip
+    )
 
 
 def _geometry(element: Element, where: str) -> Geometry:

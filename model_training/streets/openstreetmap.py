@@ -87,11 +87,13 @@ def read_openstreetmap(
     order = sorted(of_name, key=lambda name: (min(way.rank for way in of_name[name]), in_natural_order(name)))
     streets = tuple(
         NamedStreet(
-            street=name, name=name, lines=tuple(way.line for way in of_name[name]),
+            street=name,
+            name=name,
+            lines=tuple(way.line for way in of_name[name]),
             surface=corridor([way.line for way in of_name[name]], [way.width_m for way in of_name[name]]),
         )
         for name in order
-    )  # fmt: skip
+    )
     return StreetSource(streets, left_out[_UNNAMED], reasons)
 
 

@@ -61,12 +61,18 @@ def _cut(street: NamedStreet, length_m: float, cut: Cut) -> list[NamedStreet]:
             named = [(first, "beginning"), (street.name, None), (last, "end")]
     return [
         replace(
-            street, name=name, section=section, surface=ground, divisible=False,
+            street,
+            name=name,
+            section=section,
+            surface=ground,
+            divisible=False,
             id=None if street.id is None else f"{street.id}-{section or number + 1}",
         )
-        for number, ((name, section), ground) in enumerate(zip(named, _divided(street.surface, axis, bounds), strict=True))
+        for number, ((name, section), ground) in enumerate(
+            zip(named, _divided(street.surface, axis, bounds), strict=True)
+        )
         if not ground.is_empty
-    ]  # fmt: skip
+    ]
 
 
 def _divided(surface: BaseGeometry, axis: shapely.LineString, bounds: NDArray[np.float64]) -> list[BaseGeometry]:

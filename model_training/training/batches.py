@@ -75,7 +75,7 @@ def open_cities(folders: list[Path], grid: ViewGrid, *, turn_deg: float, pairs: 
                 f"of a place, but a batch needs {pairs} pairs; create the city with more places or queries, or train "
                 f"with --pairs {len(city.usable)} or fewer",
                 field="pairs",
-            )  # fmt: skip
+            )
         cities.append(city)
     return cities
 
@@ -123,8 +123,15 @@ class City:
             return torch.from_numpy(np.ascontiguousarray(array)).float()
 
         return Batch(
-            tensor(views(pack.panoramas)), (tensor(views(pack.intensities)) / 255) ** 2, tensor(places[:, 3]),
-            tensor(pack.ranges[chosen]), tensor(pack.rgb[chosen].transpose(0, 3, 1, 2)), tensor(queries[:, 3]),
-            torch.from_numpy(np.array(pack.rows_seen)), tensor(places[:, :2]), tensor(queries[:, :2]), chosen,
+            tensor(views(pack.panoramas)),
+            (tensor(views(pack.intensities)) / 255) ** 2,
+            tensor(places[:, 3]),
+            tensor(pack.ranges[chosen]),
+            tensor(pack.rgb[chosen].transpose(0, 3, 1, 2)),
+            tensor(queries[:, 3]),
+            torch.from_numpy(np.array(pack.rows_seen)),
+            tensor(places[:, :2]),
+            tensor(queries[:, :2]),
+            chosen,
             None if pack.seen is None else torch.from_numpy(np.ascontiguousarray(pack.seen[chosen])),
-        )  # fmt: skip
+        )

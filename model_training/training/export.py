@@ -36,10 +36,15 @@ def export(net: EncoderNet, out: Path, *, trained_on: tuple[str, ...] = ()) -> f
     buffer = io.BytesIO()
     with torch.no_grad():
         torch.onnx.export(
-            net, example, buffer,  # type: ignore[arg-type]  # the tracing exporter writes to buffers too
-            input_names=["planes", "side"], output_names=["descriptor"], opset_version=17, dynamo=False,
+            net,
+            example,
+            buffer,  # type: ignore[arg-type]  # the tracing exporter writes to buffers too
+            input_names=["planes", "side"],
+            output_names=["descriptor"],
+            opset_version=17,
+            dynamo=False,
             dynamic_axes={"planes": {0: "batch"}, "side": {0: "batch"}, "descriptor": {0: "batch"}},
-        )  # fmt: skip
+        )
     net.eval()  # the tracing exporter leaves the module in training mode
     model = onnx.load_from_string(buffer.getvalue())
     onnx.helper.set_model_props(model, {"trained_on": " ".join(trained_on)})

@@ -123,8 +123,9 @@ def _layers(encoder: Path) -> list[tuple[Floats, Floats]]:
             values, scale, zero = (*parts, np.zeros(1)) if len(parts) == 2 else parts
             along = (-1,) + (1,) * (values.ndim - 1) if scale.ndim else ()
             known[node.output[0]] = (
-                (values.astype(np.float32) - zero.astype(np.float32).reshape(along if zero.size > 1 else ())) * scale.reshape(along)
-            ).astype(np.float32)  # fmt: skip
+                (values.astype(np.float32) - zero.astype(np.float32).reshape(along if zero.size > 1 else ()))
+                * scale.reshape(along)
+            ).astype(np.float32)
         elif node.op_type == "Identity" and node.input[0] in known:  # torch stores equal tensors only once
             known[node.output[0]] = known[node.input[0]]
     found = []
@@ -142,9 +143,12 @@ def _shape(encoder: Encoder, layers: list[tuple[Floats, Floats]], path: Path) ->
         raise _foreign(path, f"it has {len(layers)} layers with weights, not 12")
     outputs = [len(bias) for _, bias in layers]
     return EncoderShape(
-        rows=encoder.rows, columns=encoder.columns, widths=(outputs[0], outputs[1], outputs[6], outputs[9]),
-        narrow=outputs[10], descriptor=outputs[11],
-    )  # fmt: skip
+        rows=encoder.rows,
+        columns=encoder.columns,
+        widths=(outputs[0], outputs[1], outputs[6], outputs[9]),
+        narrow=outputs[10],
+        descriptor=outputs[11],
+    )
 
 
 def _foreign(path: Path, why: str) -> EncoderError:

@@ -194,9 +194,18 @@ def train(
 
     def save(step: int) -> None:
         part = checkpoint.with_suffix(".part")
-        torch.save({"net": net.state_dict(), "optimiser": optimiser.state_dict(), "log_scale": log_scale.detach(), "step": step,
-                    "generator": generator.get_state(), "rng": json.dumps(rng.bit_generator.state),
-                    "memories": [memory.state() for memory in memories]}, part)  # fmt: skip
+        torch.save(
+            {
+                "net": net.state_dict(),
+                "optimiser": optimiser.state_dict(),
+                "log_scale": log_scale.detach(),
+                "step": step,
+                "generator": generator.get_state(),
+                "rng": json.dumps(rng.bit_generator.state),
+                "memories": [memory.state() for memory in memories],
+            },
+            part,
+        )
         part.rename(checkpoint)
 
     net.train()
@@ -224,10 +233,12 @@ def train(
                 place
             )
             losses, first_ones = _LOSSES[config.loss](
-                q, m, scale=scale,
+                q,
+                m,
+                scale=scale,
                 more_queries=Side(memory.queries[earlier], memory.queries_xy[earlier]),
                 more_surveys=Side(memory.surveys[earlier], memory.surveys_xy[earlier]),
-            )  # fmt: skip
+            )
             memory.keep(batch.pairs, q.descriptors, m.descriptors, q.xy, m.xy, step)
             loss = losses.mean()
             optimiser.zero_grad(set_to_none=True)
@@ -322,14 +333,19 @@ def views_of(batch: Batch, augment: Augmenter, place: torch.device, *, blind: tu
         part = slice(first, min(first + size, count))
         rows_seen = augment.cut_rows(batch.rows_seen.to(place), part.stop - first)
         planes[count + first : count + part.stop] = augment.survey(
-            batch.survey_ranges[part].to(place), batch.survey_intensity[part].to(place),
-            batch.survey_height_m[part].to(place), rows_seen,
-        )  # fmt: skip
+            batch.survey_ranges[part].to(place),
+            batch.survey_intensity[part].to(place),
+            batch.survey_height_m[part].to(place),
+            rows_seen,
+        )
         seen = None if batch.query_seen is None else batch.query_seen[part].to(place)
         planes[part] = augment.query(
-            batch.query_ranges[part].to(place), batch.query_rgb[part].to(place), batch.query_height_m[part].to(place), rows_seen,
+            batch.query_ranges[part].to(place),
+            batch.query_rgb[part].to(place),
+            batch.query_height_m[part].to(place),
+            rows_seen,
             seen=seen,
-        )  # fmt: skip
+        )
     planes[:count, [PLANES.index(name) for name in blind]] = 0.0
     return planes
 

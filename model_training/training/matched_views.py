@@ -99,11 +99,20 @@ class RigOfADrive:
         metering = float(self._rng.uniform(*METERING))  # both cameras of a rig have the same exposure
         left, right = (
             take(
-                self._scene, self._city.ground, self._rig.camera, T, self._light, self._condition, self._rgb, self._rng,
-                rays_camera=self._rays, z_of_ray=self._z_of_ray, metering=metering,
+                self._scene,
+                self._city.ground,
+                self._rig.camera,
+                T,
+                self._light,
+                self._condition,
+                self._rgb,
+                self._rng,
+                rays_camera=self._rays,
+                z_of_ray=self._z_of_ray,
+                metering=metering,
             ).rgb
             for T in (T_map_camera, T_map_camera @ self._stereo.T_left_right)
-        )  # fmt: skip
+        )
         depth_m = self._stereo.depth(left, right)
         level = level_camera(depth_m, self._rig.camera, down_camera=None, nominal_height_m=NOMINAL_HEIGHT_M)
         ranges, colour, seen = gather(left, depth_m, self._rig.camera, level.R_level_camera.T, grid)

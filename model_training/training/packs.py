@@ -107,11 +107,13 @@ class Pack:
         """
         remedy = f"remove {folder}, so that the next training creates the city again"
         matched = MATCHED in folder.name
-        return Pack(**{
-            name: read_arrays(path, partial(np.load, path, mmap_mode="r", allow_pickle=False), remedy=remedy)
-            for name, path in ((name, folder / f"{name}.npy") for name in Pack.__annotations__)
-            if name != "seen" or matched
-        })  # fmt: skip
+        return Pack(
+            **{
+                name: read_arrays(path, partial(np.load, path, mmap_mode="r", allow_pickle=False), remedy=remedy)
+                for name, path in ((name, folder / f"{name}.npy") for name in Pack.__annotations__)
+                if name != "seen" or matched
+            }
+        )
 
 
 def _digest(rigs: tuple[MatchedRig, ...]) -> str:
@@ -197,8 +199,11 @@ def make_pack(plan: PackPlan, folder: Path, grid: ViewGrid) -> None:
         places[k] = (x, y, heading_of_body(np.vstack([np.c_[R_map_level, [0, 0, 0]], [0, 0, 0, 1]])), level.height_m)
     del survey
     arrays: dict[str, NDArray[np.generic]] = {
-        "panoramas": panoramas, "intensities": intensities, "places": places, "rows_seen": rows_seen_by(panoramas),
-    }  # fmt: skip
+        "panoramas": panoramas,
+        "intensities": intensities,
+        "places": places,
+        "rows_seen": rows_seen_by(panoramas),
+    }
     arrays |= (_matched_queries if plan.rigs else _queries)(city, plan, places, grid, rng)
     part = folder.with_name(folder.name + ".part")
     part.mkdir(parents=True, exist_ok=True)

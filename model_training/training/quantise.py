@@ -122,9 +122,16 @@ def _in_eight_bits(encoder: Path, model: onnx.ModelProto, ranges: Iterable[Views
             str(encoder), str(plain), skip_symbolic_shape=True
         )  # folds constants, which the next step needs
         quantize_static(
-            str(plain), str(whole), Reader(), quant_format=QuantFormat.QDQ, activation_type=QuantType.QUInt8,
-            weight_type=QuantType.QInt8, per_channel=True, reduce_range=True, op_types_to_quantize=list(QUANTISED),
-        )  # fmt: skip
+            str(plain),
+            str(whole),
+            Reader(),
+            quant_format=QuantFormat.QDQ,
+            activation_type=QuantType.QUInt8,
+            weight_type=QuantType.QInt8,
+            per_channel=True,
+            reduce_range=True,
+            op_types_to_quantize=list(QUANTISED),
+        )
         found = onnx.load(whole)
     told = {each.key: each.value for each in model.metadata_props}
     onnx.helper.set_model_props(found, told | {"bits": "8"})

@@ -57,22 +57,28 @@ _MACHINE = (RGBS["machine"], "hard_light", (-0.3, 1.0))
 #: The car's rig is KITTI's with half the pixels, and therefore half the rectification errors in pixels.
 MATCHED_RIGS = (
     MatchedRig(
-        CameraPlan(width=621, height=188, horizontal_deg=81.4).pinhole(), (1.5, 1.8),
-        replace(STEREOS["sgbm"], focal_baseline_px_m=192.0, offset_px=0.28, vertical_px=0.2, roll_px=0.2), *_MACHINE,
+        CameraPlan(width=621, height=188, horizontal_deg=81.4).pinhole(),
+        (1.5, 1.8),
+        replace(STEREOS["sgbm"], focal_baseline_px_m=192.0, offset_px=0.28, vertical_px=0.2, roll_px=0.2),
+        *_MACHINE,
     ),
     MatchedRig(
-        CameraPlan(width=480, height=270, horizontal_deg=90.0).pinhole(), (1.0, 1.6),
+        CameraPlan(width=480, height=270, horizontal_deg=90.0).pinhole(),
+        (1.0, 1.6),
         replace(STEREOS["sgbm"], focal_baseline_px_m=60.0, offset_px=0.2, vertical_px=0.15, roll_px=0.15),
     ),
     MatchedRig(
-        CameraPlan(width=621, height=188, horizontal_deg=81.4).pinhole(), (1.5, 1.8),
+        CameraPlan(width=621, height=188, horizontal_deg=81.4).pinhole(),
+        (1.5, 1.8),
         replace(STEREOS["sgbm3way"], focal_baseline_px_m=192.0, offset_px=0.28, vertical_px=0.2, roll_px=0.2),
     ),
     MatchedRig(
-        CameraPlan(width=480, height=300, horizontal_deg=80.0).pinhole(), (0.7, 1.2),
-        replace(STEREOS["bm"], focal_baseline_px_m=76.0, offset_px=0.22, vertical_px=0.16, roll_px=0.16), *_MACHINE,
+        CameraPlan(width=480, height=300, horizontal_deg=80.0).pinhole(),
+        (0.7, 1.2),
+        replace(STEREOS["bm"], focal_baseline_px_m=76.0, offset_px=0.22, vertical_px=0.16, roll_px=0.16),
+        *_MACHINE,
     ),
-)  # fmt: skip
+)
 #: Index of the first seed of ``matched_plans``, after those of the stock recipe.
 _MATCHED_FROM = 40
 _MATCHED_LIDARS = ("hdl_64", "hdl_32", "hdl_64", "os1_64", "hdl_64")
@@ -90,11 +96,15 @@ def matched_plans(cities: int = _MATCHED) -> list[PackPlan]:
     """
     return [
         PackPlan(
-            seed=TRAINING_SEEDS[_MATCHED_FROM + k], name="mixed", places=1000, queries_a_place=1,
-            lidar=_MATCHED_LIDARS[k % len(_MATCHED_LIDARS)], rigs=MATCHED_RIGS,
+            seed=TRAINING_SEEDS[_MATCHED_FROM + k],
+            name="mixed",
+            places=1000,
+            queries_a_place=1,
+            lidar=_MATCHED_LIDARS[k % len(_MATCHED_LIDARS)],
+            rigs=MATCHED_RIGS,
         )
         for k in range(cities)
-    ]  # fmt: skip
+    ]
 
 
 def watch_plans() -> list[PackPlan]:

@@ -84,11 +84,15 @@ def _lines(fm: Any, name: str, strips_m: Iterable[NDArray[np.float64]], stamp: A
     """Return an update that replaces the entity of its name; an empty update removes the last line."""
     lines = [
         fm.LinePrimitive(
-            type=fm.LinePrimitiveLineType.LineStrip, pose=_pose(fm, _at(np.zeros(3))), thickness=_LINE_M,
-            points=[fm.Point3(x=float(x), y=float(y), z=float(z)) for x, y, z in strip], color=fm.Color(r=0.9, g=0.5, b=0.1, a=1.0),
+            type=fm.LinePrimitiveLineType.LineStrip,
+            pose=_pose(fm, _at(np.zeros(3))),
+            thickness=_LINE_M,
+            points=[fm.Point3(x=float(x), y=float(y), z=float(z)) for x, y, z in strip],
+            color=fm.Color(r=0.9, g=0.5, b=0.1, a=1.0),
         )
-        for strip in strips_m if len(strip)
-    ]  # fmt: skip
+        for strip in strips_m
+        if len(strip)
+    ]
     return fm.SceneUpdate(entities=[fm.SceneEntity(timestamp=stamp, frame_id=_MAP, id=name, lines=lines)])
 
 
@@ -96,20 +100,34 @@ def _view(fm: Any, view: View, stamp: Any) -> list[tuple[str, Any]]:
     camera, T = view.camera, view.T_map_camera
     position, q = T[:3, 3], quaternion_xyzw_from(T[:3, :3])
     moved = fm.FrameTransform(
-        timestamp=stamp, parent_frame_id=_MAP, child_frame_id=_CAMERA,
+        timestamp=stamp,
+        parent_frame_id=_MAP,
+        child_frame_id=_CAMERA,
         translation=fm.Vector3(x=float(position[0]), y=float(position[1]), z=float(position[2])),
         rotation=fm.Quaternion(x=float(q[0]), y=float(q[1]), z=float(q[2]), w=float(q[3])),
-    )  # fmt: skip
+    )
     K = [float(value) for value in camera.matrix.ravel()]
     projection = [*K[:3], 0.0, *K[3:6], 0.0, *K[6:], 0.0]
     calibration = fm.CameraCalibration(
-        timestamp=stamp, frame_id=_CAMERA, width=camera.width, height=camera.height, K=K, R=[1.0, 0, 0, 0, 1.0, 0, 0, 0, 1.0], P=projection
-    )  # fmt: skip
+        timestamp=stamp,
+        frame_id=_CAMERA,
+        width=camera.width,
+        height=camera.height,
+        K=K,
+        R=[1.0, 0, 0, 0, 1.0, 0, 0, 0, 1.0],
+        P=projection,
+    )
     depth_mm = millimetres(view.depth_m).astype("<u2")
     height, width = depth_mm.shape
     depth = fm.RawImage(
-        timestamp=stamp, frame_id=_CAMERA, width=width, height=height, encoding="16UC1", step=2 * width, data=depth_mm.tobytes()
-    )  # fmt: skip
+        timestamp=stamp,
+        frame_id=_CAMERA,
+        width=width,
+        height=height,
+        encoding="16UC1",
+        step=2 * width,
+        data=depth_mm.tobytes(),
+    )
     return [
         ("/tf", fm.FrameTransforms(transforms=[moved])),
         (f"/{view.topic}/calibration", calibration),

@@ -20,8 +20,12 @@ def events_of_map(bundle: MapBundle, *, most_points: int) -> Iterator[Event]:
         surfels = bundle.cloud.surfels[:: max(1, -(-len(bundle.cloud.surfels) // most_points))]
         upright = 1 - np.abs(surfels["normal"][:, 2])
         yield Cloud(
-            "map/cloud", None, bundle.cloud.origin_m, surfels["xyz"].astype(np.float32), (90 + 150 * upright).astype(np.uint8)
-        )  # fmt: skip
+            "map/cloud",
+            None,
+            bundle.cloud.origin_m,
+            surfels["xyz"].astype(np.float32),
+            (90 + 150 * upright).astype(np.uint8),
+        )
     yield Track("map/places", None, bundle.T_map_place[:, :3, 3])
     if bundle.streets is not None and bundle.earth is None:
         ground_m = float(np.median(bundle.T_map_place[:, 2, 3])) - bundle.manifest.lidar_height_m

@@ -11,9 +11,12 @@ from model_training.viewing.events import Cloud, Event, Note, Outlines, Poses, T
 _TIMELINE = "time"
 #: Colours of poses by topic; others are grey.
 _COLOURS = {
-    "query/truth": (40, 180, 110), "answer/pose": (220, 60, 50), "answer/registered": (240, 160, 40),
-    "answer/hypotheses": (80, 140, 230), "answer/neighbours": (140, 140, 140),
-}  # fmt: skip
+    "query/truth": (40, 180, 110),
+    "answer/pose": (220, 60, 50),
+    "answer/registered": (240, 160, 40),
+    "answer/hypotheses": (80, 140, 230),
+    "answer/neighbours": (140, 140, 140),
+}
 _GREY, _AXIS_M = (140, 140, 140), 2.0
 
 
@@ -73,9 +76,13 @@ def _drawn(rr: Any, event: Event) -> list[tuple[str, Any]]:
 def _view(rr: Any, view: View) -> list[tuple[str, Any]]:
     camera, T = view.camera, view.T_map_camera
     pinhole = rr.Pinhole(
-        focal_length=(camera.fx, camera.fy), principal_point=(camera.cx + 0.5, camera.cy + 0.5),  # rerun counts from the corner
-        width=camera.width, height=camera.height, camera_xyz=rr.ViewCoordinates.RDF, image_plane_distance=_AXIS_M,
-    )  # fmt: skip
+        focal_length=(camera.fx, camera.fy),
+        principal_point=(camera.cx + 0.5, camera.cy + 0.5),  # rerun counts from the corner
+        width=camera.width,
+        height=camera.height,
+        camera_xyz=rr.ViewCoordinates.RDF,
+        image_plane_distance=_AXIS_M,
+    )
     return [
         (view.topic, rr.Transform3D(translation=T[:3, 3], mat3x3=T[:3, :3])),
         (f"{view.topic}/picture", pinhole),

@@ -37,8 +37,9 @@ def events_of(folder: Path, *, most_scans: int, most_points: int) -> Iterator[Ev
     else:
         raise DatasetError(
             f"{folder} is not a dataset, a map bundle or a folder of `evaluate --report`: it has none "
-            f"of dataset.json, {manifest.FILE}, {saved_run.FILE}", field="source",
-        )  # fmt: skip
+            f"of dataset.json, {manifest.FILE}, {saved_run.FILE}",
+            field="source",
+        )
 
 
 def _map_of(run: SavedRun, most_points: int) -> Iterator[Event]:

@@ -99,14 +99,20 @@ class FpfhMap:
         self._o3d.utility.random.seed(0)
         cloud, features = self._prepared(points)
         found = registration.registration_ransac_based_on_feature_matching(
-            cloud, self._cloud, features, self._features, True, NEAR_M,
-            registration.TransformationEstimationPointToPoint(False), 3,
+            cloud,
+            self._cloud,
+            features,
+            self._features,
+            True,
+            NEAR_M,
+            registration.TransformationEstimationPointToPoint(False),
+            3,
             [
                 registration.CorrespondenceCheckerBasedOnEdgeLength(0.9),
                 registration.CorrespondenceCheckerBasedOnDistance(NEAR_M),
             ],
             registration.RANSACConvergenceCriteria(RANSAC_ROUNDS, RANSAC_CONFIDENCE),
-        )  # fmt: skip
+        )
         if found.fitness == 0:
             return None
         finer = registration.registration_icp(
@@ -150,9 +156,14 @@ class GicpMap:
         """
         own, _ = self._package.preprocess_points(points, downsampling_resolution=VOXEL_M / 2, num_threads=1)
         found = self._package.align(
-            self._cloud, own, self._tree, T_map_camera, registration_type="GICP",
-            max_correspondence_distance=FROM_PLACE_M, num_threads=1,
-        )  # fmt: skip
+            self._cloud,
+            own,
+            self._tree,
+            T_map_camera,
+            registration_type="GICP",
+            max_correspondence_distance=FROM_PLACE_M,
+            num_threads=1,
+        )
         return np.array(found.T_target_source)
 
 

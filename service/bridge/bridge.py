@@ -108,17 +108,17 @@ class Bridge:
         """Build the diagnosis for a time without image pairs."""
         missing = self.pairs.missing()
         if missing:
-            told = ", ".join(f"{name} ({getattr(self.topics, name)})" for name in missing)
-            message = f"no messages on {told}; check that the topics have publishers"
+            listed = ", ".join(f"{name} ({getattr(self.topics, name)})" for name in missing)
+            message = f"no messages on {listed}; check that the topics have publishers"
         else:
             message = "no colour and depth image with matching stamps; synchronise the publishers, or raise --tolerance"
         return Diagnosis(0, Level.WARN, message, self._counted())
 
     def _ask(self, pair: Pair) -> Published:
         stamp_ns, began = nanoseconds_of(pair.color), self.clock()
-        self.gate.asked(began)
+        self.gate.record_query(began)
         self._recent_s.append(began)
-        self.counts.asked += 1
+        self.counts.queries += 1
         try:
             camera = camera_from(pair.info, self.topics.info, rectified=self.rectified)
             rgb, depth_m = rgb_from(pair.color, self.topics.color), depth_from(pair.depth, self.topics.depth)
@@ -157,8 +157,8 @@ def line_of(published: Published) -> str:
     pose, confidence = answer.pose, answer.confidence
     street = "" if answer.street is None else f"  {answer.street.name}"
     sure = "" if confidence is None else f" {confidence:.3f}"
-    told = "" if published.pose is not None else f"  ({diagnosis.message})"
+    reason = "" if published.pose is not None else f"  ({diagnosis.message})"
     where = ""
     if pose is not None:
         where = f"  x {pose.position.x:.2f}  y {pose.position.y:.2f}  heading {pose.heading_deg:.1f}{street}"
-    return f"{at} {answer.status}{sure}{where}{told}"
+    return f"{at} {answer.status}{sure}{where}{reason}"

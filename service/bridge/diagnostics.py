@@ -39,13 +39,13 @@ class Counts:
     """Counts since the start.
 
     Attributes:
-        asked: queries.
+        queries: queries.
         answered: queries with an answer.
         published: answers whose pose was published.
         failed: queries that ended with an error.
     """
 
-    asked: int = 0
+    queries: int = 0
     answered: int = 0
     published: int = 0
     failed: int = 0
@@ -57,9 +57,14 @@ class Counts:
             dropped: number of images that were dropped without a partner.
             rate_hz: recent rate of queries, Hz.
         """
-        counted = {"asked": self.asked, "answered": self.answered, "published": self.published, "failed": self.failed}
-        told = {name: str(count) for name, count in counted.items()}
-        return tuple((told | {"dropped": str(dropped), "rate_hz": f"{rate_hz:.2f}"}).items())
+        counted = {
+            "queries": self.queries,
+            "answered": self.answered,
+            "published": self.published,
+            "failed": self.failed,
+        }
+        texts = {name: str(count) for name, count in counted.items()}
+        return tuple((texts | {"dropped": str(dropped), "rate_hz": f"{rate_hz:.2f}"}).items())
 
 
 def of_answer(
@@ -77,13 +82,14 @@ def of_answer(
     confidence = "unknown" if answer.confidence is None else f"{answer.confidence:.3f}"
     height = answer.camera_height
     values = (
-        ("status", answer.status), ("confidence", confidence),
+        ("status", answer.status),
+        ("confidence", confidence),
         ("street", "none" if answer.street is None else answer.street.name),
         ("map", f"{answer.map.name}@{answer.map.version}"),
         ("camera_height", "unknown" if height is None else f"{height.height_m:.2f} m, {height.origin}"),
         ("calibration", answer.calibration or "unknown"),
         ("latency_ms", f"{1e3 * latency_s:.0f}"),
-    )  # fmt: skip
+    )
     if why_not:
         return Diagnosis(stamp_ns, Level.WARN, f"not published: {why_not}", values + counted)
     return Diagnosis(stamp_ns, Level.OK, f"{answer.status}, confidence {confidence}", values + counted)

@@ -17,7 +17,7 @@ class Gate:
 
     rate_hz: float = 1.0
     min_confidence: float = 0.9
-    _asked_s: float | None = None
+    _last_query_s: float | None = None
 
     def __post_init__(self) -> None:
         """Check the limits.
@@ -41,17 +41,17 @@ class Gate:
         Args:
             now_s: current time of a monotonic clock, s.
         """
-        if self._asked_s is None or not self.rate_hz:
+        if self._last_query_s is None or not self.rate_hz:
             return 0.0
-        return max(0.0, self._asked_s + 1.0 / self.rate_hz - now_s)
+        return max(0.0, self._last_query_s + 1.0 / self.rate_hz - now_s)
 
-    def asked(self, now_s: float) -> None:
+    def record_query(self, now_s: float) -> None:
         """Record the beginning of a query.
 
         Args:
             now_s: current time of a monotonic clock, s.
         """
-        self._asked_s = now_s
+        self._last_query_s = now_s
 
     def why_not(self, answer: LocalizeAnswer) -> str:
         """Return why an answer is not published; empty if it is published.

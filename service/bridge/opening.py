@@ -42,9 +42,14 @@ def opened(settings: BridgeSettings) -> Iterator[Bridge]:
         )
     with _asking(settings, height) as localize:
         yield Bridge(
-            localize=localize, topics=topics, gate=gate, pairs=pairs,
-            T_vehicle_camera=CAMERA_AS_BODY if mount is None else mount, frame_id=settings.frame, rectified=settings.rectified,
-        )  # fmt: skip
+            localize=localize,
+            topics=topics,
+            gate=gate,
+            pairs=pairs,
+            T_vehicle_camera=CAMERA_AS_BODY if mount is None else mount,
+            frame_id=settings.frame,
+            rectified=settings.rectified,
+        )
 
 
 @contextmanager
@@ -71,9 +76,14 @@ def _asking(settings: BridgeSettings, height: GivenHeight | None = None) -> Iter
 
     patience, name = RetryPolicy(attempts=_ATTEMPTS, total_s=_PATIENCE_S), settings.map_name
     with Client(
-        settings.url, api_key=settings.api_key, timeout_s=_TIMEOUT_S, retry=patience,
-        ca=settings.ca, cert=settings.cert, key=settings.key,
-    ) as client:  # fmt: skip
+        settings.url,
+        api_key=settings.api_key,
+        timeout_s=_TIMEOUT_S,
+        retry=patience,
+        ca=settings.ca,
+        cert=settings.cert,
+        key=settings.key,
+    ) as client:
         height_m, std_m = (None, None) if height is None else (height.height_m, height.std_m)
         yield lambda rgb, depth_m, camera: client.localize(
             rgb, depth_m, camera, map=name, camera_height_m=height_m, camera_height_std_m=std_m

@@ -115,8 +115,9 @@ def camera_from(message: CameraInfoLike, topic: str, *, rectified: bool = False)
     if any(message.d) and not rectified:
         raise RequestError(
             f"{topic}: the lens distorts (d = {[round(each, 4) for each in message.d]}), but the images must be rectified; subscribe to "
-            "the rectified topics of image_proc and pass --rectified", field=topic,
-        )  # fmt: skip
+            "the rectified topics of image_proc and pass --rectified",
+            field=topic,
+        )
     p, k = message.p, message.k
     fx, fy, cx, cy = (p[0], p[5], p[2], p[6]) if p[0] else (k[0], k[4], k[2], k[5])
     width, height = message.width, message.height
@@ -140,8 +141,9 @@ def _rows(message: ImageLike, topic: str, dtype: np.dtype[Any], channels: int) -
     if height < 1 or width < 1 or step < row or data.size < height * step:
         raise RequestError(
             f"{topic}: {data.size} bytes are not an image of {width}x{height} {message.encoding} with rows of {step} bytes (a row needs "
-            f"{row}, the image {height * max(step, row)}); fix the publisher", field=topic,
-        )  # fmt: skip
+            f"{row}, the image {height * max(step, row)}); fix the publisher",
+            field=topic,
+        )
     rows = data[: height * step].reshape(height, step)[:, :row]
     return np.ascontiguousarray(rows).view(dtype).reshape(height, width, channels)
 

@@ -68,8 +68,8 @@ def pose_of(answer: LocalizeAnswer, T_vehicle_camera: Transform, *, stamp_ns: in
     p, q = posed.position, posed.orientation
     rotation = rotation_from_quaternion_xyzw(np.array([q.x, q.y, q.z, q.w]))
     T_map_camera = transform_from(rotation, np.array([p.x, p.y, p.z]))
-    told = posed.covariance
-    covariance = _UNKNOWN if told is None else np.array(told, np.float64).reshape(6, 6)
+    given = posed.covariance
+    covariance = _UNKNOWN if given is None else np.array(given, np.float64).reshape(6, 6)
     T_map_vehicle = T_map_camera @ inverse(T_vehicle_camera)
     moved = about(covariance, T_map_vehicle[:3, 3] - T_map_camera[:3, 3])
     return StampedPose(stamp_ns, frame_id, T_map_vehicle, moved)
@@ -129,8 +129,9 @@ def height_from(
         if not LEAST_HEIGHT_M <= camera_height_m <= MOST_HEIGHT_M:
             raise RequestError(
                 f"--camera-height-m: {camera_height_m:g} m is not a valid camera height; give {LEAST_HEIGHT_M:g} to {MOST_HEIGHT_M:g} m, "
-                "or 0 to find it in the depth image", field="camera_height_m",
-            )  # fmt: skip
+                "or 0 to find it in the depth image",
+                field="camera_height_m",
+            )
         return GivenHeight(camera_height_m, HEIGHT_STD_M)
     if not base_on_ground:
         return None

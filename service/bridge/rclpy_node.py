@@ -41,8 +41,9 @@ def ros_node(*, args: list[str] | None = None, domain: int | None = None) -> Ite
     except ModuleNotFoundError as error:
         raise ExtraMissingError(
             f"--node rclpy needs the package {error.name!r}, which comes with ROS 2: source /opt/ros/DISTRIBUTION/setup.bash in an "
-            "environment with system packages, or use --node dds, which needs no ROS", field="node",
-        ) from error  # fmt: skip
+            "environment with system packages, or use --node dds, which needs no ROS",
+            field="node",
+        ) from error
     rclpy.init(args=args, domain_id=domain, signal_handler_options=SignalHandlerOptions.NO)
     try:
         node = rclpy.create_node(NODE)
@@ -57,7 +58,7 @@ def ros_node(*, args: list[str] | None = None, domain: int | None = None) -> Ite
 def run(
     bridge: Bridge,
     over: Event | Wakeup,
-    told: Callable[[Published], None] = lambda _: None,
+    callback: Callable[[Published], None] = lambda _: None,
     *,
     domain: int = 0,
     reliable: bool = False,
@@ -68,7 +69,7 @@ def run(
     Args:
         bridge: that processes the messages.
         over: ends the loop; set from elsewhere, for example by a signal.
-        told: called with the result of every processed pair.
+        callback: called with the result of every processed pair.
         domain: ``ROS_DOMAIN_ID`` of the robot.
         reliable: request lost images again; see ``DdsNode``.
         depth: length of the image queue during a query; 0 keeps all.
@@ -77,14 +78,14 @@ def run(
         ExtraMissingError: rclpy or a ROS message package is not installed.
     """
     with ros_node(domain=domain) as node:
-        spin(node, bridge, over, told, reliable=reliable, depth=depth)
+        spin(node, bridge, over, callback, reliable=reliable, depth=depth)
 
 
 def spin(
     node: Any,
     bridge: Bridge,
     over: Event | Wakeup,
-    told: Callable[[Published], None] = lambda _: None,
+    callback: Callable[[Published], None] = lambda _: None,
     *,
     reliable: bool = False,
     depth: int = 5,
@@ -95,7 +96,7 @@ def spin(
         node: of ``ros_node``.
         bridge: that processes the messages.
         over: ends the loop; set from elsewhere, for example by a signal.
-        told: called with the result of every processed pair.
+        callback: called with the result of every processed pair.
         reliable: request lost images again; see ``DdsNode``.
         depth: length of the image queue during a query; 0 keeps all.
     """
@@ -124,7 +125,7 @@ def spin(
             if published.pose is not None:
                 poses.publish(filled_pose(PoseWithCovarianceStamped(), published.pose))
             diagnoses.publish(filled_diagnostics(DiagnosticArray(), published.diagnosis, now))
-            told(published)
+            callback(published)
         elif bridge.clock() - spoken_s < max(_IDLE_S, bridge.quiet_s()):
             continue
         else:
@@ -161,8 +162,11 @@ def filled_diagnostics(message: Any, diagnosis: Diagnosis, now: Any) -> Any:
     message.header.stamp = now
     message.status = [
         DiagnosticStatus(
-            level=bytes([diagnosis.level]), name=NAME, message=diagnosis.message, hardware_id="streetfix",
+            level=bytes([diagnosis.level]),
+            name=NAME,
+            message=diagnosis.message,
+            hardware_id="streetfix",
             values=[KeyValue(key=name, value=value) for name, value in diagnosis.values],
         )
-    ]  # fmt: skip
+    ]
     return message

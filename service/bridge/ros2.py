@@ -85,12 +85,12 @@ class DdsNode:
                 field="domain",
             ) from error
 
-    def run(self, over: Event | Wakeup, told: Callable[[Published], None] = lambda _: None) -> None:
+    def run(self, over: Event | Wakeup, callback: Callable[[Published], None] = lambda _: None) -> None:
         """Process images and publish the results until ``over`` is set.
 
         Args:
             over: ends the loop; set from elsewhere, for example by a signal.
-            told: called with the result of every processed pair.
+            callback: called with the result of every processed pair.
         """
         spoken_s = time.monotonic() - IDLE_S
         while not over.is_set():
@@ -101,7 +101,7 @@ class DdsNode:
                 self._take()
                 while not over.is_set() and (published := self._bridge.step()) is not None:
                     self._publish(published)
-                    told(published)
+                    callback(published)
                     spoken_s = time.monotonic()
             if time.monotonic() - spoken_s >= max(IDLE_S, self._bridge.quiet_s()):
                 self._say(self._bridge.idle())
@@ -154,9 +154,12 @@ def diagnostics_message(diagnosis: Diagnosis) -> messages.DiagnosticArray:
         diagnosis: to publish.
     """
     status = messages.DiagnosticStatus(
-        level=int(diagnosis.level), name=NAME, message=diagnosis.message, hardware_id="streetfix",
+        level=int(diagnosis.level),
+        name=NAME,
+        message=diagnosis.message,
+        hardware_id="streetfix",
         values=[messages.KeyValue(name, value) for name, value in diagnosis.values],
-    )  # fmt: skip
+    )
     return messages.DiagnosticArray(header=messages.Header(stamp_message(time.time_ns())), status=[status])
 
 

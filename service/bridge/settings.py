@@ -18,8 +18,8 @@ class BridgeSettings:
 
     Attributes:
         url: of the service.
-        map: folder of a map bundle to answer from in this process; None asks the service.
-        map_name: map to ask.
+        map: folder of a map bundle that answers in this process; None sends queries to the service.
+        map_name: name of the map that the service uses.
         api_key: of the service.
         ca: PEM file of the authorities of the service's certificate.
         cert: PEM file of the client's certificate.
@@ -42,8 +42,10 @@ class BridgeSettings:
     """
 
     url: Annotated[str, "URL of the service."] = "http://127.0.0.1:8000"
-    map: Annotated[Path | None, "Answer from this map bundle in this process. The bridge then asks no service."] = None
-    map_name: Annotated[str | None, "Map to ask. Required if the service has several."] = None
+    map: Annotated[Path | None, "Answer from this map bundle in this process. The bridge then uses no service."] = None
+    map_name: Annotated[
+        str | None, "Name of the map that the service uses. Required if the service has several maps."
+    ] = None
     api_key: Annotated[str | None, "API key, if the service requires one."] = None
     ca: Annotated[Path | None, "PEM file of the authorities that may sign the service's certificate."] = None
     cert: Annotated[Path | None, "PEM file of this client's certificate, if the service requires one."] = None
@@ -67,13 +69,16 @@ class BridgeSettings:
         "--mount.",
     ] = False
     camera_height_m: Annotated[
-        float, "Height of the camera above the ground, metres. 0: from --base-on-ground, else the depth image tells it."
+        float,
+        "Height of the camera above the ground, metres. 0: from --base-on-ground, otherwise from the depth image.",
     ] = 0.0
     rectified: Annotated[bool, "The images are rectified, whatever lens the CameraInfo describes."] = False
     rate: Annotated[float, "Largest number of queries per second. 0 sends one for every pair."] = 1.0
     min_confidence: Annotated[float, "Smallest confidence of a published pose. 0 passes every LOCALIZED answer."] = 0.9
     tolerance: Annotated[float, "Largest difference between the stamps of colour and depth, seconds."] = 0.02
-    reliable: Annotated[bool, "Request lost images again. The bridge then hears no best-effort publishers."] = False
+    reliable: Annotated[
+        bool, "Request lost images again. The bridge then receives nothing from best-effort publishers."
+    ] = False
     queue: Annotated[int, "Images that wait during a query. 0 keeps all."] = 5
 
 

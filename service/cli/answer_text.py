@@ -61,10 +61,14 @@ def print_outcomes(names: list[str], outcomes: list[dict[str, Any]], console: Co
             continue
         pose, street, confidence = answer["pose"], answer["street"], answer["confidence"]
         table.add_row(
-            str(number), escape(name), answer["status"], "" if confidence is None else f"{confidence:.3f}",
+            str(number),
+            escape(name),
+            answer["status"],
+            "" if confidence is None else f"{confidence:.3f}",
             escape(street["name"]) if pose is not None and street is not None else "",
-            "" if pose is None else _metres(pose["position"]), "" if pose is None else f"{pose['heading_deg']:.1f}",
-        )  # fmt: skip
+            "" if pose is None else _metres(pose["position"]),
+            "" if pose is None else f"{pose['heading_deg']:.1f}",
+        )
     # A file or a pipe needs no line breaks at the width of a terminal.
     Console(file=out.file, width=None if out.is_terminal else max(out.width, _WIDTH)).print(table)
     for line in problems:
@@ -76,17 +80,23 @@ def print_outcomes(names: list[str], outcomes: list[dict[str, Any]], console: Co
 def _facts(answer: dict[str, Any]) -> list[tuple[str, str]]:
     pose, street, place = answer["pose"], answer["street"], answer["map"]
     confidence = answer["confidence"]
-    status = ("status", answer["status"] + ("" if confidence is None else f" (confidence {confidence:.3f})"))
+    threshold = answer.get("threshold")  # an older service sends none
+    least = "" if threshold is None else f"; LOCALIZED from {threshold['confidence']:.2f}"
+    status = ("status", answer["status"] + ("" if confidence is None else f" (confidence {confidence:.3f}{least})"))
     outside = ", ".join(f"{name} {size:+.1f}" for name, size in answer.get("extrapolated", {}).items())
     calibrated = [("calibration", f"extrapolated (standard deviations from the mean: {outside})")] if outside else []
     version = ("map", f"{place['name']}, version {place['version']}")
-    told = answer.get("camera_height")  # an older service sends none
-    height = [] if told is None else [("camera", _height(told))]
+    given = answer.get("camera_height")  # an older service sends none
+    height = [] if given is None else [("camera", _height(given))]
     if pose is None:
         return [
-            status, ("pose", "none: the answer is not LOCALIZED"), ("spread", _doubt(answer["spread"])), *calibrated, *height,
+            status,
+            ("pose", "none: the answer is not LOCALIZED"),
+            ("spread", _doubt(answer["spread"])),
+            *calibrated,
+            *height,
             version,
-        ]  # fmt: skip
+        ]
     facts = [
         status,
         ("street", "none" if street is None else f"{street['name']} ({street['vote']:.0%} of the votes)"),
@@ -103,10 +113,10 @@ def _facts(answer: dict[str, Any]) -> list[tuple[str, str]]:
     return [*facts, *calibrated, *height, version]
 
 
-def _height(told: dict[str, Any]) -> str:
+def _height(given: dict[str, Any]) -> str:
     """Text for the height of the camera and its origin."""
-    why = "; the depth image shows no ground, so give --camera-height" if told["origin"] == "assumed" else ""
-    return f"{told['height_m']:.2f} m above the ground ({told['origin']}{why})"
+    why = "; the depth image shows no ground, so give --camera-height" if given["origin"] == "assumed" else ""
+    return f"{given['height_m']:.2f} m above the ground ({given['origin']}{why})"
 
 
 def _focal(factor: float) -> str:
@@ -122,8 +132,8 @@ def _why(answer: dict[str, Any]) -> list[str]:
     if factor is not None:
         found.append(_focal(factor))
     for reason in answer.get("reasons", []):  # an older service sends no reasons
-        told = ", ".join(f"{name} {size:+.1f}" for name, size in reason["evidence"].items())
-        where = f" (standard deviations from the mean of the calibration data: {told})" if told else ""
+        listed = ", ".join(f"{name} {size:+.1f}" for name, size in reason["evidence"].items())
+        where = f" (standard deviations from the mean of the calibration data: {listed})" if listed else ""
         found.append(f"{reason['check']}{where}: {reason['remedy']}")
     if found:
         return [
@@ -162,9 +172,12 @@ def _hypotheses(hypotheses: list[dict[str, Any]]) -> Table:
     )
     for each in hypotheses:
         table.add_row(
-            f"{each['share']:.2f}", f"{each['inliers']:.2f}", f"{each['similarity']:.3f}", _metres(each["pose"]["position"]),
+            f"{each['share']:.2f}",
+            f"{each['inliers']:.2f}",
+            f"{each['similarity']:.3f}",
+            _metres(each["pose"]["position"]),
             f"{each['pose']['heading_deg']:.0f}",
-        )  # fmt: skip
+        )
     return table
 
 

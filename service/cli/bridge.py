@@ -67,11 +67,29 @@ def ros2(
       streetfix bridge ros2 --url http://127.0.0.1:8000 --mount 0.2,0,0.5,-0.5,0.5,-0.5,0.5 --rate 0.5
     """
     settings = BridgeSettings(
-        url=url, map=map_bundle, map_name=map_name, api_key=api_key, ca=ca, cert=cert, key=key, color_topic=color_topic,
-        depth_topic=depth_topic, info_topic=info_topic, pose_topic=pose_topic, diagnostics_topic=diagnostics_topic, frame=frame,
-        mount=mount, base_on_ground=base_on_ground, camera_height_m=camera_height_m, rectified=rectified, rate=rate,
-        min_confidence=min_confidence, tolerance=tolerance, reliable=reliable, queue=queue,
-    )  # fmt: skip
+        url=url,
+        map=map_bundle,
+        map_name=map_name,
+        api_key=api_key,
+        ca=ca,
+        cert=cert,
+        key=key,
+        color_topic=color_topic,
+        depth_topic=depth_topic,
+        info_topic=info_topic,
+        pose_topic=pose_topic,
+        diagnostics_topic=diagnostics_topic,
+        frame=frame,
+        mount=mount,
+        base_on_ground=base_on_ground,
+        camera_height_m=camera_height_m,
+        rectified=rectified,
+        rate=rate,
+        min_confidence=min_confidence,
+        tolerance=tolerance,
+        reliable=reliable,
+        queue=queue,
+    )
     run = _node_of(node, domain=domain, reliable=reliable, depth=queue)
     from service.bridge.opening import opened, until_signalled
 

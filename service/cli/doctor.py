@@ -60,12 +60,12 @@ def command(
             typer.echo(f"{each.level:<7}  {each.check}: {each.text}" + (f"; {each.remedy}" if each.remedy else ""))
     count = {level: sum(each.level == level for each in findings) for level in ("problem", "warning")}
     if as_json:
-        told = {
+        report = {
             "problems": count["problem"],
             "warnings": count["warning"],
             "findings": [asdict(each) for each in findings],
         }
-        typer.echo(json.dumps(told, indent=1))
+        typer.echo(json.dumps(report, indent=1))
     else:
         typer.echo(f"problems: {count['problem']}, warnings: {count['warning']}")
     if count["problem"]:

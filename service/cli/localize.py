@@ -159,9 +159,14 @@ def command(
 
 
 def _check_choice(
-    *, rgb: Path | None, depth: Path | None, camera: Path | None, sequence: Path | None, batch: Path | None,
+    *,
+    rgb: Path | None,
+    depth: Path | None,
+    camera: Path | None,
+    sequence: Path | None,
+    batch: Path | None,
     try_focal: bool | None,
-) -> None:  # fmt: skip
+) -> None:
     """Refuse options that do not belong together."""
     single = {"--rgb": rgb, "--depth": depth, "--camera": camera}
     several = {"--sequence": sequence, "--batch": batch}

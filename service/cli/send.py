@@ -274,9 +274,14 @@ def _send(
     files["request"] = ("request.json", json.dumps(request).encode(), "application/json")
     retry = RetryPolicy() if attempts is None else RetryPolicy(attempts=attempts)
     with Client(
-        connection.url, api_key=connection.api_key, timeout_s=_TIMEOUT_S, retry=retry, ca=connection.ca, cert=connection.cert,
+        connection.url,
+        api_key=connection.api_key,
+        timeout_s=_TIMEOUT_S,
+        retry=retry,
+        ca=connection.ca,
+        cert=connection.cert,
         key=connection.key,
-    ) as client:  # fmt: skip
+    ) as client:
         try:
             return client.call(rest.Call("POST", path, read, files))
         except RefusedError as error:

@@ -98,10 +98,19 @@ def command(
 
     (check_only if check else serve)(
         load_settings(
-            config, maps=tuple(maps) if maps else None, host=host, port=port, grpc_port=grpc_port, threads=threads, queue=queue,
-            workers=workers, strict=strict, false_accept_rate=false_accept_rate, samples=samples,
+            config,
+            maps=tuple(maps) if maps else None,
+            host=host,
+            port=port,
+            grpc_port=grpc_port,
+            threads=threads,
+            queue=queue,
+            workers=workers,
+            strict=strict,
+            false_accept_rate=false_accept_rate,
+            samples=samples,
         )
-    )  # fmt: skip
+    )
 
 
 def check_only(settings: "Settings") -> None:
@@ -197,18 +206,20 @@ def _answer_by_workers(settings: "Settings") -> None:
                 table = SharedServingTable(memory, number)
                 if (error := reserve(counts)) is not None:
                     del os.environ[METRICS_FOLDER]
-                    told = (
+                    message = (
                         f"worker {number} reports only its own metrics until it is started again ({counts}: "
                         f"{error.strerror})"
                     )
-                    typer.echo(f"streetfix: {told}", err=True)
+                    typer.echo(f"streetfix: {message}", err=True)
                 _answer(shared, listener, health, table=table, ready=ready, says_where=number == 0)
 
         # Requests and streams each end within the grace period. A worker that runs much longer hangs.
         code = supervise(
-            settings.workers, work, ended=partial(release, counts),
+            settings.workers,
+            work,
+            ended=partial(release, counts),
             kill_after_s=settings.drain_s + 2 * settings.grace_s + 10.0,
-        )  # fmt: skip
+        )
     if code:
         raise typer.Exit(code)
 
@@ -259,9 +270,16 @@ def _answer(
         engine = Engine.open(settings, table)
         try:
             config = uvicorn.Config(
-                create_app(engine, keys), http=BoundedHttp, ws="none", proxy_headers=False, log_config=None, access_log=False,
-                lifespan="off", timeout_graceful_shutdown=math.ceil(settings.grace_s), **({} if tls is None else tls.for_uvicorn()),
-            )  # fmt: skip
+                create_app(engine, keys),
+                http=BoundedHttp,
+                ws="none",
+                proxy_headers=False,
+                log_config=None,
+                access_log=False,
+                lifespan="off",
+                timeout_graceful_shutdown=math.ceil(settings.grace_s),
+                **({} if tls is None else tls.for_uvicorn()),
+            )
             beside = [] if health is None else [(health, _plain(create_health_app(engine)))]
             with (
                 _grpc(engine, keys, tls) as (grpc_port, leave),

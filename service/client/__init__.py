@@ -5,9 +5,9 @@
 
 from typing import TYPE_CHECKING, Any
 
-from service.client.asking import About, AboutSequence, Frame
 from service.client.async_client import AsyncClient
 from service.client.client import Client
+from service.client.prepare import About, AboutSequence, Frame
 from service.client.retry import RetryPolicy
 from service.contract.schema import (
     LocalizeAnswer,

@@ -10,9 +10,9 @@ from typing import Any, Self, TypeVar, Unpack
 
 import httpx
 
-from service.client import asking, rest
-from service.client.asking import About, AboutSequence, Camera, Depth, Frame, Rgb
+from service.client import prepare, rest
 from service.client.encode import JPEG_QUALITY, Packing
+from service.client.prepare import About, AboutSequence, Camera, Depth, Frame, Rgb
 from service.client.retry import Attempts, RetryPolicy
 from service.client.tls import ClientTls
 from service.contract.schema import LocalizeAnswer, MapEntry
@@ -78,8 +78,8 @@ class AsyncClient:
             camera: rectified intrinsics, pixels. Either image may be a uniformly resized version of this camera's image.
             **about: optional data; see ``About``.
         """
-        asked = await asyncio.to_thread(asking.one, rgb, depth, camera, about, self._packing)
-        return await self.call(rest.localize(asked))
+        prepared = await asyncio.to_thread(prepare.one, rgb, depth, camera, about, self._packing)
+        return await self.call(rest.localize(prepared))
 
     async def localize_sequence(self, frames: Sequence[Frame], **about: Unpack[AboutSequence]) -> LocalizeAnswer:
         """Localize the first frame of a sequence, as ``Client.localize_sequence`` does.
@@ -88,8 +88,8 @@ class AsyncClient:
             frames: the first frame is the reference. Each further frame needs ``T_reference_camera``, as from odometry.
             **about: optional data; see ``AboutSequence``.
         """
-        asked = await asyncio.to_thread(asking.sequence, frames, about, self._packing)
-        return await self.call(rest.localize_sequence(asked))
+        prepared = await asyncio.to_thread(prepare.sequence, frames, about, self._packing)
+        return await self.call(rest.localize_sequence(prepared))
 
     async def localize_batch(
         self, frames: Sequence[Frame], **about: Unpack[AboutSequence]
@@ -100,8 +100,8 @@ class AsyncClient:
             frames: the queries. ``T_reference_camera`` must be None.
             **about: optional data for every query; see ``AboutSequence``.
         """
-        asked = await asyncio.to_thread(asking.several, frames, about, self._packing)
-        return await self.call(rest.localize_batch(asked))
+        prepared = await asyncio.to_thread(prepare.several, frames, about, self._packing)
+        return await self.call(rest.localize_batch(prepared))
 
     async def maps(self) -> list[MapEntry]:
         """Return all mounted maps, as ``Client.maps`` does."""

@@ -9,9 +9,9 @@ from typing import Any, Self, TypeVar, Unpack
 
 import httpx
 
-from service.client import asking, rest
-from service.client.asking import About, AboutSequence, Camera, Depth, Frame, Rgb
+from service.client import prepare, rest
 from service.client.encode import JPEG_QUALITY, Packing
+from service.client.prepare import About, AboutSequence, Camera, Depth, Frame, Rgb
 from service.client.retry import Attempts, RetryPolicy
 from service.client.tls import ClientTls
 from service.contract.schema import LocalizeAnswer, MapEntry
@@ -105,7 +105,7 @@ class Client:
             UnreachableError: no Streetfix service answers, or not in time.
             HandshakeError: TLS failed. The message says what to check.
         """
-        return self.call(rest.localize(asking.one(rgb, depth, camera, about, self._packing)))
+        return self.call(rest.localize(prepare.one(rgb, depth, camera, about, self._packing)))
 
     def localize_sequence(self, frames: Sequence[Frame], **about: Unpack[AboutSequence]) -> LocalizeAnswer:
         """Localize the first frame of a sequence whose relative camera poses are known.
@@ -117,7 +117,7 @@ class Client:
         Raises:
             StreetfixError: as ``localize``.
         """
-        return self.call(rest.localize_sequence(asking.sequence(frames, about, self._packing)))
+        return self.call(rest.localize_sequence(prepare.sequence(frames, about, self._packing)))
 
     def localize_batch(
         self, frames: Sequence[Frame], **about: Unpack[AboutSequence]
@@ -134,7 +134,7 @@ class Client:
         Raises:
             StreetfixError: as ``localize``, for the batch as a whole.
         """
-        return self.call(rest.localize_batch(asking.several(frames, about, self._packing)))
+        return self.call(rest.localize_batch(prepare.several(frames, about, self._packing)))
 
     def maps(self) -> list[MapEntry]:
         """Return all mounted maps.

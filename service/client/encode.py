@@ -89,7 +89,7 @@ def encode_rgb(rgb: NDArray[np.uint8], *, quality: int | None = JPEG_QUALITY) ->
     """
     if not isinstance(rgb, np.ndarray) or rgb.dtype != np.uint8 or rgb.ndim != 3 or rgb.shape[2] != 3 or not rgb.size:
         raise RequestError(
-            f"rgb: must be uint8 (H, W, 3), not {_told(rgb)}; pass such an array, or the bytes of an image file",
+            f"rgb: must be uint8 (H, W, 3), not {_described(rgb)}; pass such an array, or the bytes of an image file",
             field="rgb",
         )
     if quality is not None and not 1 <= quality <= 100:
@@ -126,7 +126,8 @@ def encode_depth(depth: NDArray[Any], *, scale_m: float | None = None, codec: Co
     """
     if not isinstance(depth, np.ndarray) or depth.ndim != 2 or not depth.size or depth.dtype.str[1:] not in _DTYPES:
         raise RequestError(
-            f"depth: must be a float or uint16 array (H, W), not {_told(depth)}; pass metres as float32, or the bytes of an image file",
+            f"depth: must be a float or uint16 array (H, W), not {_described(depth)}; "
+            "pass metres as float32, or the bytes of an image file",
             field="depth",
         )
     if scale_m is not None and not (math.isfinite(scale_m) and scale_m > 0):
@@ -169,5 +170,5 @@ def _npy(values: NDArray[Any]) -> bytes:
     return stream.getvalue()
 
 
-def _told(given: object) -> str:
+def _described(given: object) -> str:
     return f"{given.dtype} {given.shape}" if isinstance(given, np.ndarray) else f"a {type(given).__name__}"

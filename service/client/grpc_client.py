@@ -9,10 +9,10 @@ from typing import Any, Self, TypeVar, Unpack
 
 import grpc
 
-from service.client import asking, grpc_messages
-from service.client.asking import About, AboutSequence, Camera, Depth, Frame, Rgb
+from service.client import grpc_messages, prepare
 from service.client.encode import JPEG_QUALITY, Packing
 from service.client.grpc_errors import errors_of_grpc, refused_in_batch
+from service.client.prepare import About, AboutSequence, Camera, Depth, Frame, Rgb
 from service.client.rest import geojson
 from service.client.retry import Attempts, RetryPolicy
 from service.client.tls import ClientTls
@@ -132,7 +132,7 @@ class GrpcClient:
             camera: rectified intrinsics, pixels. Either image may be a uniformly resized version of this camera's image.
             **about: optional data; see ``About``.
         """
-        message = grpc_messages.request_message(asking.one(rgb, depth, camera, about, self._packing))
+        message = grpc_messages.request_message(prepare.one(rgb, depth, camera, about, self._packing))
         return self._call(self._stub.Localize, message, grpc_messages.answer_of)
 
     def localize_sequence(self, frames: Sequence[Frame], **about: Unpack[AboutSequence]) -> LocalizeAnswer:
@@ -142,7 +142,7 @@ class GrpcClient:
             frames: the first frame is the reference. Each further frame needs ``T_reference_camera``, as from odometry.
             **about: optional data; see ``AboutSequence``.
         """
-        message = grpc_messages.sequence_message(asking.sequence(frames, about, self._packing))
+        message = grpc_messages.sequence_message(prepare.sequence(frames, about, self._packing))
         return self._call(self._stub.LocalizeSequence, message, lambda got: grpc_messages.answer_of(got.answer))
 
     def localize_batch(
@@ -154,7 +154,7 @@ class GrpcClient:
             frames: the queries. ``T_reference_camera`` must be None.
             **about: optional data for every query; see ``AboutSequence``.
         """
-        message = grpc_messages.batch_message(asking.several(frames, about, self._packing))
+        message = grpc_messages.batch_message(prepare.several(frames, about, self._packing))
         return self._call(self._stub.LocalizeBatch, message, _outcomes)
 
     def maps(self) -> list[MapEntry]:

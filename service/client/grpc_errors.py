@@ -48,19 +48,23 @@ def refused_in_batch(problem: pb.Problem) -> RefusedError:
         problem: the problem that the service reported for this query.
     """
     return refused(
-        problem.title, problem.detail, problem=problem.code, status="", field=problem.field,
+        problem.title,
+        problem.detail,
+        problem=problem.code,
+        status="",
+        field=problem.field,
         may_come_back=problem.code in ("busy", "not-ready"),
-    )  # fmt: skip
+    )
 
 
 def _of(error: grpc.RpcError, address: str, timeout_s: float, tls: ClientTls | None) -> StreetfixError:
     if not isinstance(error, grpc.Call):
         return UnreachableError(f"{address}: the call failed ({error}); check the address", field="url")
     code, said = error.code(), error.details() or ""
-    told = _details(error)
-    info = told.get(error_details_pb2.ErrorInfo.DESCRIPTOR.full_name)
+    details = _details(error)
+    info = details.get(error_details_pb2.ErrorInfo.DESCRIPTOR.full_name)
     if isinstance(info, error_details_pb2.ErrorInfo):
-        return _refused(error, told, info)
+        return _refused(error, details, info)
     if code == grpc.StatusCode.DEADLINE_EXCEEDED:
         return NoAnswerInTimeError(
             f"{address}: no answer within {timeout_s:g} s; try again, or raise timeout_s", field="timeout_s"
@@ -80,16 +84,21 @@ def _of(error: grpc.RpcError, address: str, timeout_s: float, tls: ClientTls | N
     return refused(code.name, said, problem=problem, status=code.name, request_id=_request_id(error))
 
 
-def _refused(error: grpc.Call, told: dict[str, Message], info: error_details_pb2.ErrorInfo) -> StreetfixError:
-    bad = told.get(error_details_pb2.BadRequest.DESCRIPTOR.full_name)
+def _refused(error: grpc.Call, details: dict[str, Message], info: error_details_pb2.ErrorInfo) -> StreetfixError:
+    bad = details.get(error_details_pb2.BadRequest.DESCRIPTOR.full_name)
     fields = bad.field_violations if isinstance(bad, error_details_pb2.BadRequest) else ()
-    again = told.get(error_details_pb2.RetryInfo.DESCRIPTOR.full_name)
+    again = details.get(error_details_pb2.RetryInfo.DESCRIPTOR.full_name)
     wait = again.retry_delay if isinstance(again, error_details_pb2.RetryInfo) else None
     return refused(
-        info.reason, error.details() or "", problem=info.reason, status=error.code().name,
-        field=fields[0].field if fields else "", request_id=_request_id(error), may_come_back=wait is not None,
+        info.reason,
+        error.details() or "",
+        problem=info.reason,
+        status=error.code().name,
+        field=fields[0].field if fields else "",
+        request_id=_request_id(error),
+        may_come_back=wait is not None,
         retry_after_s=None if wait is None else wait.ToTimedelta().total_seconds(),
-    )  # fmt: skip
+    )
 
 
 def _details(error: grpc.Call) -> dict[str, Message]:

@@ -2,7 +2,7 @@
 
 from typing import Any
 
-from service.client.asking import Asked
+from service.client.prepare import PreparedRequest
 from service.contract import schema
 from service.grpc.generated.streetfix.v1 import localization_pb2 as pb
 
@@ -11,43 +11,51 @@ _CALIBRATION = {pb.CALIBRATION_RANGE_IN_RANGE: "in_range", pb.CALIBRATION_RANGE_
 _STATUS_PREFIX, _SECTION_PREFIX, _ORIGIN_PREFIX = "LOCALIZATION_STATUS_", "STREET_SECTION_", "CAMERA_HEIGHT_ORIGIN_"
 
 
-def request_message(asked: Asked[schema.LocalizeRequest]) -> pb.LocalizeRequest:
+def request_message(prepared: PreparedRequest[schema.LocalizeRequest]) -> pb.LocalizeRequest:
     """Return the message for a single query.
 
     Args:
-        asked: the request and its encoded images.
+        prepared: the request and its encoded images.
     """
-    return _pair(asked.document, asked.pictures[0])
+    return _pair(prepared.document, prepared.pictures[0])
 
 
-def batch_message(asked: Asked[schema.BatchRequest]) -> pb.LocalizeBatchRequest:
+def batch_message(prepared: PreparedRequest[schema.BatchRequest]) -> pb.LocalizeBatchRequest:
     """Return the message for a batch of independent queries.
 
     Args:
-        asked: the request and its encoded images.
+        prepared: the request and its encoded images.
     """
-    pairs = zip(asked.document.requests, asked.pictures, strict=True)
+    pairs = zip(prepared.document.requests, prepared.pictures, strict=True)
     return pb.LocalizeBatchRequest(requests=[_pair(request, pictures) for request, pictures in pairs])
 
 
-def sequence_message(asked: Asked[schema.SequenceRequest]) -> pb.LocalizeSequenceRequest:
+def sequence_message(prepared: PreparedRequest[schema.SequenceRequest]) -> pb.LocalizeSequenceRequest:
     """Return the message for a sequence.
 
     Args:
-        asked: the request and its encoded images.
+        prepared: the request and its encoded images.
     """
-    request = asked.document
+    request = prepared.document
     frames = [
         pb.SequenceFrame(
-            rgb=rgb, depth=depth, camera=_camera(frame.camera), depth_format=_depth(frame.depth), gravity=_vector(frame.gravity),
+            rgb=rgb,
+            depth=depth,
+            camera=_camera(frame.camera),
+            depth_format=_depth(frame.depth),
+            gravity=_vector(frame.gravity),
             reference_from_camera=_transform(frame.T_reference_camera),
         )
-        for frame, (rgb, depth) in zip(request.frames, asked.pictures, strict=True)
-    ]  # fmt: skip
+        for frame, (rgb, depth) in zip(request.frames, prepared.pictures, strict=True)
+    ]
     return pb.LocalizeSequenceRequest(
-        map=request.map, frames=frames, vehicle_from_camera=_transform(request.T_vehicle_camera), prior=_prior(request.prior),
-        options=_options(request.options), vehicle_base_on_ground=request.vehicle_base_on_ground,
-    )  # fmt: skip
+        map=request.map,
+        frames=frames,
+        vehicle_from_camera=_transform(request.T_vehicle_camera),
+        prior=_prior(request.prior),
+        options=_options(request.options),
+        vehicle_base_on_ground=request.vehicle_base_on_ground,
+    )
 
 
 def answer_of(message: pb.LocalizeResponse) -> schema.LocalizeAnswer:
@@ -70,32 +78,46 @@ def answer_of(message: pb.LocalizeResponse) -> schema.LocalizeAnswer:
             "geopose": _geopose_content(message.geopose) if message.HasField("geopose") else None,
             "hypotheses": [
                 {
-                    "confirmed": each.confirmed, "pose": _pose_content(each.pose), "share": each.share, "inliers": each.inliers,
+                    "confirmed": each.confirmed,
+                    "pose": _pose_content(each.pose),
+                    "share": each.share,
+                    "inliers": each.inliers,
                     "similarity": each.similarity,
                 }
                 for each in message.hypotheses
             ],
             "spread": _spread_content(message.spread) if message.HasField("spread") else None,
             "reasons": [
-                {"check": each.check, "evidence": dict(each.evidence), "remedy": each.remedy} for each in message.reasons
+                {"check": each.check, "evidence": dict(each.evidence), "remedy": each.remedy}
+                for each in message.reasons
             ],
             "neighbours": [
                 {
-                    "place": each.place, "distance": each.distance, "similarity": each.similarity,
+                    "place": each.place,
+                    "distance": each.distance,
+                    "similarity": each.similarity,
                     "street": each.street if each.HasField("street") else None,
-                    "position": _xyz(each.position), "heading_deg": each.heading_deg,
+                    "position": _xyz(each.position),
+                    "heading_deg": each.heading_deg,
                 }
                 for each in message.neighbours
             ],
             "camera_height": _height_content(message.camera_height) if message.HasField("camera_height") else None,
             "calibration": _CALIBRATION.get(message.calibration),
             "extrapolated": dict(message.extrapolated),
+            "threshold": {
+                "confidence": message.threshold.confidence,
+                "false_accept_rate": message.threshold.false_accept_rate,
+            }
+            if message.HasField("threshold")
+            else None,
             "map": {"name": message.map.name, "version": message.map.version},
             "timings_ms": {
-                stage: getattr(times, f"{stage}_ms") for stage in ("decode", "fuse", "encode", "search", "register", "total")
+                stage: getattr(times, f"{stage}_ms")
+                for stage in ("decode", "fuse", "encode", "search", "register", "total")
             },
         }
-    )  # fmt: skip
+    )
 
 
 def map_of(message: pb.MapEntry) -> schema.MapEntry:
@@ -114,10 +136,17 @@ def map_of(message: pb.MapEntry) -> schema.MapEntry:
 def _pair(request: schema.LocalizeRequest, pictures: tuple[bytes, bytes]) -> pb.LocalizeRequest:
     rgb, depth = pictures
     return pb.LocalizeRequest(
-        map=request.map, rgb=rgb, depth=depth, camera=_camera(request.camera), depth_format=_depth(request.depth),
-        gravity=_vector(request.gravity), vehicle_from_camera=_transform(request.T_vehicle_camera),
-        options=_options(request.options), prior=_prior(request.prior), vehicle_base_on_ground=request.vehicle_base_on_ground,
-    )  # fmt: skip
+        map=request.map,
+        rgb=rgb,
+        depth=depth,
+        camera=_camera(request.camera),
+        depth_format=_depth(request.depth),
+        gravity=_vector(request.gravity),
+        vehicle_from_camera=_transform(request.T_vehicle_camera),
+        options=_options(request.options),
+        prior=_prior(request.prior),
+        vehicle_base_on_ground=request.vehicle_base_on_ground,
+    )
 
 
 def _camera(camera: schema.Camera) -> pb.Camera:
@@ -144,8 +173,9 @@ def _prior(prior: schema.Prior | None) -> pb.Prior | None:
     return pb.Prior(
         position=None if position is None else pb.PriorPosition(**position.model_dump()),
         wgs84=None if wgs84 is None else pb.PriorWgs84(**wgs84.model_dump()),
-        heading_deg=prior.heading_deg, heading_std_deg=prior.heading_std_deg,
-    )  # fmt: skip
+        heading_deg=prior.heading_deg,
+        heading_std_deg=prior.heading_std_deg,
+    )
 
 
 def _vector(vector: schema.Direction | None) -> pb.Vector3 | None:
@@ -171,9 +201,11 @@ def _xyzw(message: pb.Quaternion) -> dict[str, float]:
 
 def _pose_content(message: pb.Pose) -> dict[str, Any]:
     return {
-        "position": _xyz(message.position), "orientation": _xyzw(message.orientation), "heading_deg": message.heading_deg,
+        "position": _xyz(message.position),
+        "orientation": _xyzw(message.orientation),
+        "heading_deg": message.heading_deg,
         "covariance": list(message.covariance) or None,
-    }  # fmt: skip
+    }
 
 
 def _height_content(message: pb.CameraHeight) -> dict[str, Any]:
@@ -183,9 +215,11 @@ def _height_content(message: pb.CameraHeight) -> dict[str, Any]:
 
 def _spread_content(message: pb.Spread) -> dict[str, Any]:
     return {
-        "mean": _xyz(message.mean), "covariance": list(message.covariance), "heading_std_deg": message.heading_std_deg,
+        "mean": _xyz(message.mean),
+        "covariance": list(message.covariance),
+        "heading_std_deg": message.heading_std_deg,
         "hypotheses_weight": message.hypotheses_weight,
-    }  # fmt: skip
+    }
 
 
 def _geopose_content(message: pb.GeoPose) -> dict[str, Any]:
@@ -196,6 +230,10 @@ def _geopose_content(message: pb.GeoPose) -> dict[str, Any]:
 def _street_content(message: pb.Street) -> dict[str, Any]:
     section = pb.StreetSection.Name(message.section).removeprefix(_SECTION_PREFIX).lower()
     return {
-        "id": message.id, "name": message.name, "street": message.street, "class_index": message.class_index,
-        "section": None if section == "unspecified" else section, "vote": message.vote,
-    }  # fmt: skip
+        "id": message.id,
+        "name": message.name,
+        "street": message.street,
+        "class_index": message.class_index,
+        "section": None if section == "unspecified" else section,
+        "vote": message.vote,
+    }

@@ -29,8 +29,12 @@ def refused(
     where = f" [field {field}]" if field else ""
     error = (UnavailableError if may_come_back else RefusedError)(
         f"the service refused: {title}\n  {detail}{where}\n  request id {request_id or 'unknown'}",
-        field=field, problem=problem, detail=detail, status=status, request_id=request_id,
-    )  # fmt: skip
+        field=field,
+        problem=problem,
+        detail=detail,
+        status=status,
+        request_id=request_id,
+    )
     if isinstance(error, UnavailableError):
         error.retry_after_s = retry_after_s
     return error

@@ -14,7 +14,7 @@ from urllib.parse import quote
 import httpx
 from pydantic import BaseModel, ValidationError
 
-from service.client.asking import Asked
+from service.client.prepare import PreparedRequest
 from service.client.problems import refused
 from service.client.tls import ClientTls, closed_hint, handshake_error, ssl_reason
 from service.contract import schema
@@ -74,36 +74,38 @@ class _Outcomes(BaseModel):
     outcomes: list[_Outcome]
 
 
-def localize(asked: Asked[schema.LocalizeRequest]) -> Call[schema.LocalizeAnswer]:
+def localize(prepared: PreparedRequest[schema.LocalizeRequest]) -> Call[schema.LocalizeAnswer]:
     """Return the call for a single query.
 
     Args:
-        asked: the request and its encoded images.
+        prepared: the request and its encoded images.
     """
-    (rgb, depth), *_ = asked.pictures
-    return Call("POST", "/v1/localize", schema.LocalizeAnswer.model_validate_json, _parts(asked, rgb=rgb, depth=depth))
+    (rgb, depth), *_ = prepared.pictures
+    return Call(
+        "POST", "/v1/localize", schema.LocalizeAnswer.model_validate_json, _parts(prepared, rgb=rgb, depth=depth)
+    )
 
 
-def localize_sequence(asked: Asked[schema.SequenceRequest]) -> Call[schema.LocalizeAnswer]:
+def localize_sequence(prepared: PreparedRequest[schema.SequenceRequest]) -> Call[schema.LocalizeAnswer]:
     """Return the call for a sequence.
 
     Args:
-        asked: the request and its encoded images.
+        prepared: the request and its encoded images.
     """
-    return Call("POST", "/v1/localize/sequence", schema.LocalizeAnswer.model_validate_json, _numbered(asked))
+    return Call("POST", "/v1/localize/sequence", schema.LocalizeAnswer.model_validate_json, _numbered(prepared))
 
 
-def localize_batch(asked: Asked[schema.BatchRequest]) -> Call[list[schema.LocalizeAnswer | RefusedError]]:
+def localize_batch(prepared: PreparedRequest[schema.BatchRequest]) -> Call[list[schema.LocalizeAnswer | RefusedError]]:
     """Return the call for a batch of independent queries.
 
     Args:
-        asked: the request and its encoded images.
+        prepared: the request and its encoded images.
     """
 
     def read(body: bytes) -> list[schema.LocalizeAnswer | RefusedError]:
         return [_outcome(each) for each in _Outcomes.model_validate_json(body).outcomes]
 
-    return Call("POST", "/v1/localize/batch", read, _numbered(asked))
+    return Call("POST", "/v1/localize/batch", read, _numbered(prepared))
 
 
 def maps() -> Call[list[schema.MapEntry]]:
@@ -166,13 +168,14 @@ def settings_for(url: str, *, api_key: str | None, timeout_s: float, tls: Client
     if address.scheme == "http" and tls.is_argument:
         raise RequestError(f"url: {url!r} has no TLS, but ca, cert or key is given; pass https://", field="url")
     return {
-        "base_url": url.rstrip("/"), "timeout": timeout_s,
+        "base_url": url.rstrip("/"),
+        "timeout": timeout_s,
         # Without TLS httpx would still load all public authorities. An empty context saves that time.
         "verify": tls.context() if address.scheme == "https" else ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT),
         "headers": {} if api_key is None else {"Authorization": f"Bearer {api_key}"},
         # A proxy of the environment is for other machines. It cannot reach the loopback of this machine.
         "trust_env": address.host not in _LOOPBACK,
-    }  # fmt: skip
+    }
 
 
 def answer_of(call: Call[A], response: httpx.Response) -> A:
@@ -193,7 +196,7 @@ def answer_of(call: Call[A], response: httpx.Response) -> A:
     except ValueError as error:  # includes ValidationError and JSONDecodeError
         raise ForeignServiceError(
             f"{response.url}: the server is not Streetfix, or has another contract; check the address", field="url"
-        ) from error  # fmt: skip
+        ) from error
 
 
 @contextmanager
@@ -232,8 +235,8 @@ def errors_of_httpx(url: str, timeout_s: float, tls: ClientTls) -> Iterator[None
         ) from error
     except (httpx.HTTPError, httpx.StreamError) as error:
         reason = str(error) or type(error).__name__
-        told = ssl_reason(error)
-        handshake = None if told is None else handshake_error(url, told)
+        tls_reason = ssl_reason(error)
+        handshake = None if tls_reason is None else handshake_error(url, tls_reason)
         if handshake is not None:
             raise handshake from error
         remedy = "start one with: streetfix serve BUNDLE"
@@ -254,10 +257,15 @@ def _problem_of(response: httpx.Response) -> RefusedError:
             field="url",
         )
     return refused(
-        problem.title or response.reason_phrase, problem.detail, problem=problem.code, status=str(response.status_code),
-        field=problem.field or "", request_id=problem.request_id or response.headers.get(REQUEST_ID, ""),
-        may_come_back=may_come_back, retry_after_s=retry_after_s(response.headers.get("Retry-After")),
-    )  # fmt: skip
+        problem.title or response.reason_phrase,
+        problem.detail,
+        problem=problem.code,
+        status=str(response.status_code),
+        field=problem.field or "",
+        request_id=problem.request_id or response.headers.get(REQUEST_ID, ""),
+        may_come_back=may_come_back,
+        retry_after_s=retry_after_s(response.headers.get("Retry-After")),
+    )
 
 
 def retry_after_s(header: str | None, *, now: datetime | None = None) -> float | None:
@@ -285,21 +293,26 @@ def _outcome(outcome: _Outcome) -> schema.LocalizeAnswer | RefusedError:
         return outcome.answer
     if outcome.problem is None:
         raise ValueError("an outcome has neither an answer nor a problem")
-    told = outcome.problem
+    problem = outcome.problem
     return refused(
-        told.title, told.detail, problem=told.code, status=str(told.status), field=told.field or "", request_id=told.request_id,
-        may_come_back=told.status in _COME_BACK,
-    )  # fmt: skip
+        problem.title,
+        problem.detail,
+        problem=problem.code,
+        status=str(problem.status),
+        field=problem.field or "",
+        request_id=problem.request_id,
+        may_come_back=problem.status in _COME_BACK,
+    )
 
 
-def _parts(asked: Asked[Any], **pictures: bytes) -> dict[str, tuple[str, bytes, str]]:
+def _parts(prepared: PreparedRequest[Any], **pictures: bytes) -> dict[str, tuple[str, bytes, str]]:
     files = {name: (name, data, "application/octet-stream") for name, data in pictures.items()}
-    document: bytes = asked.document.model_dump_json(exclude_unset=True).encode()
+    document: bytes = prepared.document.model_dump_json(exclude_unset=True).encode()
     return files | {"request": ("request.json", document, "application/json")}
 
 
-def _numbered(asked: Asked[Any]) -> dict[str, tuple[str, bytes, str]]:
+def _numbered(prepared: PreparedRequest[Any]) -> dict[str, tuple[str, bytes, str]]:
     pictures: dict[str, bytes] = {}
-    for number, (rgb, depth) in enumerate(asked.pictures):
+    for number, (rgb, depth) in enumerate(prepared.pictures):
         pictures |= {f"rgb{number}": rgb, f"depth{number}": depth}
-    return _parts(asked, **pictures)
+    return _parts(prepared, **pictures)

@@ -103,8 +103,9 @@ class ClientTls:
             there, missing = ("cert", "key") if secret is None else ("key", "cert")
             raise RequestError(
                 f"{missing}: a client certificate and its private key belong together, but only {there} is given; pass --{missing}, "
-                f"{missing}= or {KEY if missing == 'key' else CERT} as well", field=missing,
-            )  # fmt: skip
+                f"{missing}= or {KEY if missing == 'key' else CERT} as well",
+                field=missing,
+            )
         folder = known.get(_CERT_DIR)
         return cls(named(ca, "ca", CA, _CERT_FILE), shown, secret, Path(folder) if folder else None)
 

@@ -81,8 +81,11 @@ def explain(engine: Engine, encoded: EncodedQuery) -> Explanation:
         )
     origin_m = np.round(T_map_camera[:3, 3])
     return Explanation(
-        located, {name: png_of(each) for name, each in drawn.items()}, _points(frame.query, depth_m, T_map_camera, origin_m), origin_m
-    )  # fmt: skip
+        located,
+        {name: png_of(each) for name, each in drawn.items()},
+        _points(frame.query, depth_m, T_map_camera, origin_m),
+        origin_m,
+    )
 
 
 def mapped_depth(

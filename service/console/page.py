@@ -52,7 +52,10 @@ def built_files(folder: Path = STATIC) -> dict[str, BuiltFile]:
         if path.suffix in _MEDIA_TYPES:
             name, content = path.relative_to(folder).as_posix(), path.read_bytes()
             found[name] = BuiltFile(
-                content, gzip.compress(content, mtime=0), _MEDIA_TYPES[path.suffix],
-                f'"{hashlib.sha256(content).hexdigest()[:16]}"', lasts=name != INDEX,
-            )  # fmt: skip
+                content,
+                gzip.compress(content, mtime=0),
+                _MEDIA_TYPES[path.suffix],
+                f'"{hashlib.sha256(content).hexdigest()[:16]}"',
+                lasts=name != INDEX,
+            )
     return found

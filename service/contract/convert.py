@@ -138,9 +138,14 @@ def sequence_from(
                 why = "the first frame is the reference; omit T_reference_camera here"
             raise RequestError(f"{where}.T_reference_camera: {why}", field=f"{where}.T_reference_camera")
         alone = schema.LocalizeRequest(
-            map=request.map, camera=frame.camera, depth=frame.depth, gravity=frame.gravity, options=request.options,
-            T_vehicle_camera=None if number else request.T_vehicle_camera, prior=None if number else request.prior,
-        )  # fmt: skip
+            map=request.map,
+            camera=frame.camera,
+            depth=frame.depth,
+            gravity=frame.gravity,
+            options=request.options,
+            T_vehicle_camera=None if number else request.T_vehicle_camera,
+            prior=None if number else request.prior,
+        )
         with fields_under(where):
             query = query_from(alone, rgb=rgb, depth=depth)
             T = frame.T_reference_camera
@@ -163,15 +168,17 @@ def height_over_base(T_vehicle_camera: NDArray[np.float64] | None) -> GivenHeigh
     if T_vehicle_camera is None:
         raise RequestError(
             "vehicle_base_on_ground: T_vehicle_camera is missing, and the camera height follows from it; send it, or send "
-            "camera.height_m instead", field="vehicle_base_on_ground",
-        )  # fmt: skip
+            "camera.height_m instead",
+            field="vehicle_base_on_ground",
+        )
     height_m = float(T_vehicle_camera[2, 3])
     if not LEAST_HEIGHT_M <= height_m <= MOST_HEIGHT_M:
         raise RequestError(
             f"T_vehicle_camera.position.z: with vehicle_base_on_ground, the camera would be {height_m:g} m above the ground, "
             f"outside {LEAST_HEIGHT_M:g} to {MOST_HEIGHT_M:g} m; send T_vehicle_camera of a frame on the ground (z up, "
-            "metres), or send camera.height_m without vehicle_base_on_ground", field="T_vehicle_camera.position.z",
-        )  # fmt: skip
+            "metres), or send camera.height_m without vehicle_base_on_ground",
+            field="T_vehicle_camera.position.z",
+        )
     return GivenHeight(height_m, VEHICLE_HEIGHT_STD_M)
 
 
@@ -230,6 +237,11 @@ def answer_from(located: Located) -> schema.LocalizeAnswer:
         camera_height=schema.CameraHeight(height_m=answer.height_m, origin=answer.height_origin),
         calibration=_calibration_range(answer),
         extrapolated=dict(answer.extrapolated),
+        threshold=None
+        if answer.threshold is None
+        else schema.AcceptanceThreshold(
+            confidence=answer.threshold.confidence, false_accept_rate=answer.threshold.false_accept_rate
+        ),
         map=schema.MapVersion(name=bundle.name, version=bundle.manifest.version),
         timings_ms=schema.TimingsMs(
             decode=times.decode_ms,
@@ -369,10 +381,12 @@ def _hypotheses(answer: Answer) -> list[schema.HypothesisOfPose]:
         schema.HypothesisOfPose(
             confirmed=answer.status == "LOCALIZED" and number == 0,
             pose=_pose(each.T_map_camera, heading_of_camera(each.T_map_camera), each.covariance),
-            share=float(share), inliers=each.registered.inliers, similarity=each.scores["similarity"],
+            share=float(share),
+            inliers=each.registered.inliers,
+            similarity=each.scores["similarity"],
         )
         for number, (each, share) in enumerate(zip(candidates, shares_of(candidates, answer.frames), strict=True))
-    ]  # fmt: skip
+    ]
 
 
 def _spread(spread: Spread) -> schema.Spread:
@@ -405,8 +419,9 @@ def _down(gravity: schema.Direction) -> NDArray[np.float64]:
     if abs(down[2]) > np.cos(np.deg2rad(20.0)):
         raise RequestError(
             f"gravity: ({down[0]:.2f}, {down[1]:.2f}, {down[2]:.2f}) means that the camera looks straight up or down; "
-            "send gravity in the camera frame: x right, y down, z forward", field="gravity",
-        )  # fmt: skip
+            "send gravity in the camera frame: x right, y down, z forward",
+            field="gravity",
+        )
     return down
 
 

@@ -43,11 +43,14 @@ def _made_feature(bundle: MapBundle) -> dict[str, Any]:
     return {
         "type": "Feature",
         "properties": {
-            "map": bundle.name, "version": bundle.manifest.version, "frame": "map" if bundle.earth is None else "wgs84",
-            "places": bundle.manifest.counts.places, "reach_m": REACH_M,
+            "map": bundle.name,
+            "version": bundle.manifest.version,
+            "frame": "map" if bundle.earth is None else "wgs84",
+            "places": bundle.manifest.counts.places,
+            "reach_m": REACH_M,
         },
         "geometry": {"type": "MultiPolygon", "coordinates": [[ring] for ring in rings]},
-    }  # fmt: skip
+    }
 
 
 def covered(places_m: Float64[NDArray[np.float64], "P 2"]) -> list[tuple[float, float, float, float]]:

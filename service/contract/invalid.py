@@ -23,9 +23,9 @@ def request_error_from(errors: Sequence[Any]) -> RequestError:
     Args:
         errors: as pydantic lists them; at least one.
     """
-    told = [
+    messages = [
         f"{'.'.join(str(part) for part in each['loc']) or 'the request'}: {each['msg'].removeprefix('Value error, ')}"
         for each in errors[:5]
     ]
     field = ".".join(str(part) for part in errors[0]["loc"])
-    return RequestError("; ".join(told) + "; see the schema at /openapi.json", field=field)
+    return RequestError("; ".join(messages) + "; see the schema at /openapi.json", field=field)

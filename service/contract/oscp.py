@@ -28,8 +28,13 @@ from service.runtime.engine import EncodedQuery
 
 #: Number of focal lengths and of distortion coefficients per camera model. The principal point has two numbers in each model.
 _MODELS = {
-    "SIMPLE_PINHOLE": (1, 0), "PINHOLE": (2, 0), "SIMPLE_RADIAL": (1, 1), "RADIAL": (1, 2), "OPENCV": (2, 4), "FULL_OPENCV": (2, 8),
-}  # fmt: skip
+    "SIMPLE_PINHOLE": (1, 0),
+    "PINHOLE": (2, 0),
+    "SIMPLE_RADIAL": (1, 1),
+    "RADIAL": (1, 2),
+    "OPENCV": (2, 4),
+    "FULL_OPENCV": (2, 8),
+}
 _COLOUR = ("RGBA32", "RGB", "JPG", "GRAY8")
 _MOST_READINGS = 64
 _SAME_VIEW = 0.01  # of the image size
@@ -58,14 +63,18 @@ class CameraParams(_Lenient):
     modelParams: list[_Pixels] | None = Field(None, max_length=32)
     minMaxDepth: list[_Metres] | None = Field(None, max_length=2)
     heightAboveGround: float | None = Field(
-        None, ge=LEAST_HEIGHT_M, le=MOST_HEIGHT_M,
+        None,
+        ge=LEAST_HEIGHT_M,
+        le=MOST_HEIGHT_M,
         description="height of the colour camera above the ground, metres. A field of this service, not of the protocol. Not sent: "
         "the service finds the height in the DEPTH image",
-    )  # fmt: skip
+    )
     heightAboveGroundAccuracy: float | None = Field(
-        None, ge=LEAST_HEIGHT_STD_M, le=MOST_HEIGHT_STD_M,
+        None,
+        ge=LEAST_HEIGHT_STD_M,
+        le=MOST_HEIGHT_STD_M,
         description="standard deviation of heightAboveGround, metres. A field of this service, not of the protocol",
-    )  # fmt: skip
+    )
 
 
 class ImageOrientation(_Lenient):
@@ -222,10 +231,11 @@ def query_of(request: GeoPoseRequest, map_name: str | None) -> EncodedQuery:
         f"{where}: the colour image (imageFormat RGBA32) is missing; send it together with the DEPTH image",
     )
     depth = _reading(
-        readings, ("DEPTH",),
+        readings,
+        ("DEPTH",),
         f"{where}: the depth image (imageFormat DEPTH) is missing, and this service needs colour and depth; send the image of the "
         "depth camera (16-bit PNG in mm, or float TIFF in m) as a second reading",
-    )  # fmt: skip
+    )
     _require_same_view(colour, depth)
     content: dict[str, Any] = {
         "map": map_name,
@@ -238,8 +248,9 @@ def query_of(request: GeoPoseRequest, map_name: str | None) -> EncodedQuery:
         content["prior"] = prior
     return query_from(
         checked(content, schema.LocalizeRequest),
-        rgb=_bytes(colour, f"{where}.rgb.imageBytes"), depth=_bytes(depth, f"{where}.depth.imageBytes"),
-    )  # fmt: skip
+        rgb=_bytes(colour, f"{where}.rgb.imageBytes"),
+        depth=_bytes(depth, f"{where}.depth.imageBytes"),
+    )
 
 
 def accuracy_of(covariance: list[float] | None) -> Accuracy:
@@ -289,9 +300,14 @@ def _camera(reading: CameraReading) -> dict[str, Any]:
     fx, fy = numbers[0], numbers[focal - 1]
     cx, cy = numbers[focal : focal + 2]
     return {
-        "width": int(reading.size[0]), "height": int(reading.size[1]), "fx": fx, "fy": fy, "cx": cx - 0.5, "cy": cy - 0.5,
+        "width": int(reading.size[0]),
+        "height": int(reading.size[1]),
+        "fx": fx,
+        "fy": fy,
+        "cx": cx - 0.5,
+        "cy": cy - 0.5,
         "distortion": numbers[focal + 2 :],
-    }  # fmt: skip
+    }
 
 
 def _height(reading: CameraReading) -> dict[str, float]:
@@ -311,8 +327,9 @@ def _require_same_view(colour: CameraReading, depth: CameraReading) -> None:
         if abs(one[focal] / max(one[size], 1) - other[focal] / max(other[size], 1)) > _SAME_VIEW:
             raise NotYetSupportedError(
                 f"sensorReadings.cameraReadings.depth.params: its {focal} differs from that of the colour camera; send depth that is "
-                "registered to the colour image", field="sensorReadings.cameraReadings.depth.params",
-            )  # fmt: skip
+                "registered to the colour image",
+                field="sensorReadings.cameraReadings.depth.params",
+            )
 
 
 def _depth_format(reading: CameraReading) -> dict[str, Any]:
@@ -343,13 +360,13 @@ def _prior(request: GeoPoseRequest, readings: SensorReadings) -> dict[str, Any] 
     for pose in reversed(request.priorPoses or []):
         if pose.geopose is not None:
             at, q = pose.geopose.position, pose.geopose.quaternion
-            told = None if pose.accuracy is None else pose.accuracy.position
+            accuracy_m = None if pose.accuracy is None else pose.accuracy.position
             optical = (
                 rotation_from_quaternion_xyzw(np.array([q.x, q.y, q.z, q.w]))[:, 2]
                 if any((q.x, q.y, q.z, q.w))
                 else None
             )
-            prior: dict[str, Any] = {"wgs84": _place(at.lat, at.lon, told)}
+            prior: dict[str, Any] = {"wgs84": _place(at.lat, at.lon, accuracy_m)}
             if optical is not None and np.hypot(optical[0], optical[1]) > 0.1:
                 prior |= {"heading_deg": degrees(atan2(optical[1], optical[0])), "heading_std_deg": _HEADING_STD_DEG}
             return prior

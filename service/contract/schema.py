@@ -84,13 +84,15 @@ class Camera(_Strict):
         ge=LEAST_SIDE, le=MOST_SIDE, description=f"neither side may be longer than {MOST_ASPECT} times the other"
     )
     fx: float = Field(
-        ge=LEAST_FOCAL * LEAST_SIDE, le=MOST_FOCAL * MOST_SIDE,
+        ge=LEAST_FOCAL * LEAST_SIDE,
+        le=MOST_FOCAL * MOST_SIDE,
         description=f"focal length, pixels, {LEAST_FOCAL} to {MOST_FOCAL:g} times the width",
-    )  # fmt: skip
+    )
     fy: float = Field(
-        ge=LEAST_FOCAL * LEAST_SIDE, le=MOST_FOCAL * MOST_SIDE,
+        ge=LEAST_FOCAL * LEAST_SIDE,
+        le=MOST_FOCAL * MOST_SIDE,
         description=f"focal length, pixels, {LEAST_FOCAL} to {MOST_FOCAL:g} times the height",
-    )  # fmt: skip
+    )
     cx: float = Field(ge=-2 * MOST_SIDE, le=2 * MOST_SIDE)
     cy: float = Field(ge=-2 * MOST_SIDE, le=2 * MOST_SIDE)
     distortion: list[Annotated[float, Field(ge=-1e3, le=1e3)]] = Field(
@@ -100,13 +102,17 @@ class Camera(_Strict):
         "rectify the images first",
     )
     height_m: float | None = Field(
-        None, ge=LEAST_HEIGHT_M, le=MOST_HEIGHT_M,
+        None,
+        ge=LEAST_HEIGHT_M,
+        le=MOST_HEIGHT_M,
         description="height of the camera's centre above the ground, metres. Not sent: the service finds it in the depth image",
-    )  # fmt: skip
+    )
     height_std_m: float = Field(
-        HEIGHT_STD_M, ge=LEAST_HEIGHT_STD_M, le=MOST_HEIGHT_STD_M,
+        HEIGHT_STD_M,
+        ge=LEAST_HEIGHT_STD_M,
+        le=MOST_HEIGHT_STD_M,
         description="standard deviation of height_m, metres. It counts only with height_m",
-    )  # fmt: skip
+    )
 
     @field_validator("model", mode="before")
     @classmethod
@@ -212,10 +218,12 @@ class Options(_Strict):
         "false: the answer is the pose of retrieval only, and covariance and confidence are null",
     )
     false_accept_rate: float | None = Field(
-        None, ge=LEAST_FALSE_ACCEPT_RATE, lt=1,
+        None,
+        ge=LEAST_FALSE_ACCEPT_RATE,
+        lt=1,
         description="tolerated share of out-of-map queries with status LOCALIZED. The service refuses a share below the least "
         "that the map's calibration measured. Default: the service's setting",
-    )  # fmt: skip
+    )
 
 
 #: Examples. A camera that looks along the vehicle's x axis, 1.6 m above its origin; and its pose after 0.8 m of straight travel.
@@ -489,6 +497,18 @@ class TimingsMs(BaseModel):
     total: float
 
 
+class AcceptanceThreshold(BaseModel):
+    """The threshold that decided whether an answer is LOCALIZED."""
+
+    confidence: float = Field(ge=0, le=1, description="least confidence of a LOCALIZED answer")
+    false_accept_rate: float = Field(
+        gt=0,
+        lt=1,
+        description="upper bound (95 %, Clopper and Pearson) of the share of out-of-map queries that reach this confidence, "
+        "from the calibration data. It may be lower than the requested rate: calibration measured some rates only",
+    )
+
+
 class LocalizeAnswer(BaseModel):
     """Answer to a query. Only a LOCALIZED answer has a pose, a vehicle pose, a geopose and a street.
 
@@ -545,6 +565,10 @@ class LocalizeAnswer(BaseModel):
         description="the confidence features outside that range: name, and distance from the mean of the calibration data in "
         "standard deviations. Empty unless calibration is extrapolated",
     )
+    threshold: AcceptanceThreshold | None = Field(
+        None,  # an earlier service sends none
+        description="the threshold that decided the status. Null if confidence is null",
+    )
     map: MapVersion
     timings_ms: TimingsMs
 
@@ -587,15 +611,17 @@ class LocalizeAnswer(BaseModel):
             raise self._not_localized()
         if self.vehicle_pose is None:
             raise RequestError(
-                "vehicle_pose: missing, because the request had no T_vehicle_camera; send T_vehicle_camera", field="T_vehicle_camera"
-            )  # fmt: skip
+                "vehicle_pose: missing, because the request had no T_vehicle_camera; send T_vehicle_camera",
+                field="T_vehicle_camera",
+            )
         return self.vehicle_pose
 
     def _not_localized(self) -> NotLocalizedError:
         return NotLocalizedError(
             f"the answer is {self.status} (confidence {self.confidence or 0:.3f}), so it has no pose; send a prior or more frames, "
-            "or turn the camera (the hypotheses of the answer are not confirmed)", answer=self,
-        )  # fmt: skip
+            "or turn the camera (the hypotheses of the answer are not confirmed)",
+            answer=self,
+        )
 
 
 class MapEntry(BaseModel):

@@ -66,9 +66,11 @@ def check_principal_point(camera: Camera) -> Finding:
     if min(x, y) > 0 and abs(x - y) <= OFF_CENTRE * max(x, y):
         size = f"{2 * x * camera.width:.0f}x{2 * y * camera.height:.0f}"
         return Finding(
-            "principal point", "warning", f"{text}: the intrinsics look like those of an image of about {size} px",
+            "principal point",
+            "warning",
+            f"{text}: the intrinsics look like those of an image of about {size} px",
             f"scale fx, fy, cx and cy by {0.5 / x:.3g}, or correct width and height",
-        )  # fmt: skip
+        )
     return Finding("principal point", "warning", text, f"{_CALIBRATION}; a cropped image needs cx and cy of the crop")
 
 
@@ -112,7 +114,9 @@ def check_distortion(camera: Camera) -> Finding:
     """
     if any(camera.distortion):
         return Finding(
-            "distortion", "problem", "camera.distortion is not zero, so the images are not rectified, and the service refuses them",
+            "distortion",
+            "problem",
+            "camera.distortion is not zero, so the images are not rectified, and the service refuses them",
             "rectify both images (cv2.undistort), then send the intrinsics of the rectified images and no distortion",
-        )  # fmt: skip
+        )
     return Finding("distortion", "ok", "none given: the images must be rectified")

@@ -43,16 +43,16 @@ def examine(given: Given) -> Iterator[Finding]:
     Args:
         given: what to check.
     """
-    told, settings = check_settings(given)
-    yield from _machine(given, told, settings)
+    finding, settings = check_settings(given)
+    yield from _machine(given, finding, settings)
     rate = FALSE_ACCEPT_RATE if settings is None else settings.false_accept_rate
     localizer = None
     if given.bundle is not None:
         localizer = yield from _map(given.bundle, rate)
     if given.camera is None:
         return
-    told, request = camera_file.check_camera_file(given.camera)
-    yield told
+    finding, request = camera_file.check_camera_file(given.camera)
+    yield finding
     if request is None:
         return
     yield camera_file.check_principal_point(request.camera)
@@ -86,25 +86,25 @@ def check_settings(given: Given) -> tuple[Finding, Settings | None]:
     ), settings
 
 
-def _machine(given: Given, told: Finding, settings: Settings | None) -> Iterator[Finding]:
+def _machine(given: Given, finding: Finding, settings: Settings | None) -> Iterator[Finding]:
     yield machine.check_platform()
     yield machine.check_cores()
     yield machine.check_instructions()
     yield machine.check_shared_memory()
     yield machine.check_libraries(machine.LIBRARIES)
-    yield told
+    yield finding
     if settings is not None:
         yield machine.check_port("--port", settings.host, settings.port, named=given.port is not None)
         yield machine.check_port("--grpc-port", settings.host, settings.grpc_port, named=given.grpc_port is not None)
 
 
 def _map(path: Path, false_accept_rate: float) -> Generator[Finding, None, Localizer | None]:
-    told, bundle = on_disk.check_bundle(path)
-    yield told
+    finding, bundle = on_disk.check_bundle(path)
+    yield finding
     if bundle is None:
         return None
-    told, localizer = on_disk.check_encoder(bundle)
-    yield told
+    finding, localizer = on_disk.check_encoder(bundle)
+    yield finding
     yield on_disk.check_calibration(bundle, false_accept_rate)
     yield on_disk.check_cloud(bundle)
     yield on_disk.check_streets(bundle)
@@ -122,12 +122,12 @@ def _pair(request: LocalizeRequest, rgb: Path, depth: Path) -> Generator[Finding
     except StreetfixError as error:
         yield Finding.of_error("camera file", error)
         return None
-    told, pair = check_images(encoded)
-    yield told
+    finding, pair = check_images(encoded)
+    yield finding
     if pair is None:
         return None
-    told, pair = check_depth_unit(pair)
-    yield told
+    finding, pair = check_depth_unit(pair)
+    yield finding
     yield check_measured_share(pair)
     if not pair.depth_m.any():
         return None

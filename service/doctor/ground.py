@@ -132,43 +132,57 @@ def check_ground(ground: Ground) -> Finding:
         taken_m = USUAL_HEIGHT_M if ground.given_m is None else ground.given_m
         sent = ", and send camera.height_m and gravity" if ground.given_m is None else ", and send gravity"
         return Finding(
-            check, "warning", f"no ground is visible: {ground.share:.0%} of the pixels between {NEAR_M:g} and {REACH_M:g} m lie on one "
+            check,
+            "warning",
+            f"no ground is visible: {ground.share:.0%} of the pixels between {NEAR_M:g} and {REACH_M:g} m lie on one "
             "plane below the camera",
             f"the service then assumes a level camera {taken_m:g} m above the ground; let the image show the ground{sent}",
-        )  # fmt: skip
+        )
     text = (
         f"{ground.height_m:.2f} m above the ground, {abs(ground.pitch_deg):.0f} degrees {'down' if ground.pitch_deg >= 0 else 'up'}, "
         f"rolled by {abs(ground.roll_deg):.0f} degrees"
     )
     if ground.given_m is not None and abs(ground.height_m - ground.given_m) > AGREE_M:
         return Finding(
-            check, "warning", f"{text}, but the request gives {ground.given_m:g} m",
+            check,
+            "warning",
+            f"{text}, but the request gives {ground.given_m:g} m",
             "measure the height of the camera's centre above the ground again; if it is right, depth.scale_m or fy is wrong",
-        )  # fmt: skip
+        )
     if ground.given_m is None and not least_m <= ground.height_m <= most_m:
         return Finding(
-            check, "warning", text,
+            check,
+            "warning",
+            text,
             f"the service finds heights from {least_m:g} to {most_m:g} m: send camera.height_m; if the camera is not mounted so, "
             "depth.scale_m or fy is wrong",
-        )  # fmt: skip
+        )
     if max(abs(ground.pitch_deg), abs(ground.roll_deg)) > MOST_TILT_DEG:
         return Finding(
-            check, "warning", f"{text}: more than {MOST_TILT_DEG:g} degrees off level",
+            check,
+            "warning",
+            f"{text}: more than {MOST_TILT_DEG:g} degrees off level",
             "mount the camera more level, and send gravity in every request (camera frame: x right, y down, z forward)",
-        )  # fmt: skip
+        )
     if ground.origin == "assumed":
         return Finding(
-            check, "warning", f"{text}, but the service does not accept this plane as ground and assumes {ground.found_by_service_m:.2f} m",
+            check,
+            "warning",
+            f"{text}, but the service does not accept this plane as ground and assumes {ground.found_by_service_m:.2f} m",
             "send camera.height_m and gravity in every request, or let the image show more of the ground",
-        )  # fmt: skip
+        )
     if abs(ground.height_m - ground.found_by_service_m) > AGREE_M:
         return Finding(
-            check, "warning", f"{text}, but the service uses {ground.found_by_service_m:.2f} m ({ground.origin})",
+            check,
+            "warning",
+            f"{text}, but the service uses {ground.found_by_service_m:.2f} m ({ground.origin})",
             "send camera.height_m and gravity in every request",
-        )  # fmt: skip
+        )
     if ground.given_m is None and not USUAL_RANGE_M[0] <= ground.height_m <= USUAL_RANGE_M[1]:
         return Finding(
-            check, "ok", f"{text}; the service finds this height",
+            check,
+            "ok",
+            f"{text}; the service finds this height",
             "if the camera is not mounted so, depth.scale_m or fy is wrong; if it is, camera.height_m makes the height certain",
-        )  # fmt: skip
+        )
     return Finding(check, "ok", text)

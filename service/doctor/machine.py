@@ -80,12 +80,12 @@ def check_instructions(cpuinfo: Path = Path("/proc/cpuinfo")) -> Finding:
         flags = None
     if machine != "x86_64" or flags is None:
         return Finding("instruction set", "ok", f"{machine}; the system does not report whether it has AVX2")
-    told = (
+    level_text = (
         "with AVX2"
         if "avx2" in flags[1].split()
         else "without AVX2: the answers are the same, but take somewhat longer"
     )
-    return Finding("instruction set", "ok", f"x86-64 {told}")
+    return Finding("instruction set", "ok", f"x86-64 {level_text}")
 
 
 def check_shared_memory(
@@ -111,14 +111,18 @@ def check_shared_memory(
         free = shutil.disk_usage(folder).free
     except OSError as error:
         return Finding(
-            check, "warning", f"several workers cannot share memory and files here ({error.strerror or error})",
+            check,
+            "warning",
+            f"several workers cannot share memory and files here ({error.strerror or error})",
             "let the service write to its temporary folder (TMPDIR), or keep --workers at 1",
-        )  # fmt: skip
+        )
     if free < LEAST_TEMPORARY_BYTES:
         return Finding(
-            check, "warning", f"the temporary folder {folder} has {free // _MIB} MiB left for the metrics of several workers",
+            check,
+            "warning",
+            f"the temporary folder {folder} has {free // _MIB} MiB left for the metrics of several workers",
             f"free {LEAST_TEMPORARY_BYTES // _MIB} MiB, set TMPDIR to another disk, or keep --workers at 1",
-        )  # fmt: skip
+        )
     return Finding(check, "ok", f"several workers can share memory and files; {_named_memory(shm)}")
 
 
@@ -165,7 +169,11 @@ def check_port(option: str, host: str, port: int | None, *, named: bool) -> Find
     except OSError as error:
         taken = error.errno == errno.EADDRINUSE
         return Finding(
-            check, "warning" if taken and not named else "problem", f"cannot listen on {host}:{port} ({error.strerror})",
-            f"if no Streetfix service runs there already, choose another {option}" if taken else f"choose another --host or {option}",
-        )  # fmt: skip
+            check,
+            "warning" if taken and not named else "problem",
+            f"cannot listen on {host}:{port} ({error.strerror})",
+            f"if no Streetfix service runs there already, choose another {option}"
+            if taken
+            else f"choose another --host or {option}",
+        )
     return Finding(check, "ok", f"{host}:{port} is free" if port else "the system chooses a free one")

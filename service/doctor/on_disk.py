@@ -57,18 +57,22 @@ def check_calibration(bundle: MapBundle, false_accept_rate: float) -> Finding:
     calibration = bundle.calibration
     if calibration is None:
         return Finding(
-            "calibration", "warning", "the map is not calibrated: answers have no confidence, and all of them are LOCALIZED",
+            "calibration",
+            "warning",
+            "the map is not calibrated: answers have no confidence, and all of them are LOCALIZED",
             "build the map with an encoder that has a calibration, or fit one (streetfix calibrate)",
-        )  # fmt: skip
+        )
     least = calibration.least_false_accept_rate
     if false_accept_rate < least:
         return Finding(
-            "calibration", "problem",
+            "calibration",
+            "problem",
             f"the setting false_accept_rate is {false_accept_rate:g}, but the calibration of the map supports {least:g} or more",
             f"set STREETFIX_FALSE_ACCEPT_RATE to {least:g} or more",
-        )  # fmt: skip
+        )
     site = "not corrected for this site" if calibration.site is None else "corrected for this site"
-    return Finding("calibration", "ok", f"the map is calibrated, {site}")
+    rig = "" if calibration.rig is None else f", and for a rig ({calibration.rig.measured_on})"
+    return Finding("calibration", "ok", f"the map is calibrated, {site}{rig}")
 
 
 def check_cloud(bundle: MapBundle) -> Finding:
@@ -79,9 +83,11 @@ def check_cloud(bundle: MapBundle) -> Finding:
     """
     if bundle.cloud is None:
         return Finding(
-            "cloud", "warning", "the map has no cloud: an answer is the pose of a place, without registration and confidence",
+            "cloud",
+            "warning",
+            "the map has no cloud: an answer is the pose of a place, without registration and confidence",
             "build the map again with its cloud",
-        )  # fmt: skip
+        )
     return Finding("cloud", "ok", f"{len(bundle.cloud.surfels)} surfels")
 
 
@@ -93,7 +99,9 @@ def check_streets(bundle: MapBundle) -> Finding:
     """
     if bundle.streets is None:
         return Finding(
-            "streets", "warning", "the map has no streets: answers have no street",
+            "streets",
+            "warning",
+            "the map has no streets: answers have no street",
             "create streets.geojson (streetfix streets) in the dataset and build the map again",
-        )  # fmt: skip
+        )
     return Finding("streets", "ok", f"{len(bundle.streets)} streets or sections")

@@ -51,8 +51,11 @@ def check_rows(
     check = "same heights"
     if not camera_rows.any():
         return Finding(
-            check, "warning", "the camera covers no row of the view grid of the map", "level the camera, and check its intrinsics"
-        )  # fmt: skip
+            check,
+            "warning",
+            "the camera covers no row of the view grid of the map",
+            "level the camera, and check its intrinsics",
+        )
     overlap = float(np.mean(lidar_rows[camera_rows]))
     text = (
         f"the LiDAR of the survey covers {overlap:.0%} of the rows that the camera covers (camera {_span(camera_rows, elevations_rad)}, "
@@ -61,8 +64,11 @@ def check_rows(
     if overlap >= LEAST_OVERLAP:
         return Finding(check, "ok", text)
     return Finding(
-        check, "warning", text, "level the camera so that both cover the same heights, or survey with a LiDAR that covers them"
-    )  # fmt: skip
+        check,
+        "warning",
+        text,
+        "level the camera so that both cover the same heights, or survey with a LiDAR that covers them",
+    )
 
 
 def _span(rows: Bool[NDArray[np.bool_], " rows"], elevations_rad: NDArray[np.float64]) -> str:
@@ -85,17 +91,25 @@ def answer_of(pair: Pair, localizer: Localizer, false_accept_rate: float) -> Ans
     """
     encoded, bundle = pair.encoded, localizer.bundle
     form = DepthFormat(
-        encoding=encoded.depth_encoding, kind=encoded.depth_kind, scale_m=encoded.scale_m, baseline_m=encoded.baseline_m,
+        encoding=encoded.depth_encoding,
+        kind=encoded.depth_kind,
+        scale_m=encoded.scale_m,
+        baseline_m=encoded.baseline_m,
         max_range_m=encoded.max_range_m,
-    )  # fmt: skip
+    )
     query = decoded_query(encoded.rgb, encoded.depth, encoded.camera, form, grid=bundle.grid)
     return localizer.localize(
         replace(
-            query, down_camera=encoded.down_camera, camera_height=encoded.camera_height, T_vehicle_camera=encoded.T_vehicle_camera,
-            neighbours=encoded.neighbours, refine=encoded.refine, prior=prior_in(encoded, bundle),
+            query,
+            down_camera=encoded.down_camera,
+            camera_height=encoded.camera_height,
+            T_vehicle_camera=encoded.T_vehicle_camera,
+            neighbours=encoded.neighbours,
+            refine=encoded.refine,
+            prior=prior_in(encoded, bundle),
             false_accept_rate=encoded.false_accept_rate or false_accept_rate,
         )
-    )  # fmt: skip
+    )
 
 
 def check_answer(pair: Pair, localizer: Localizer, false_accept_rate: float) -> Finding:
@@ -116,9 +130,11 @@ def check_answer(pair: Pair, localizer: Localizer, false_accept_rate: float) -> 
         if answer.extrapolated:
             outside = ", ".join(f"{name} {size:+.1f}" for name, size in answer.extrapolated)
             return Finding(
-                "answer", "warning", f"{text}, extrapolated: {outside} standard deviations from the mean of the calibration data",
+                "answer",
+                "warning",
+                f"{text}, extrapolated: {outside} standard deviations from the mean of the calibration data",
                 "the confidence may be wrong; calibrate the map on queries like this one (streetfix calibrate)",
-            )  # fmt: skip
+            )
         return Finding("answer", "ok", text)
     reasons = "; ".join(f"{each.check}: {each.remedy}" for each in answer.reasons)
     remedy = (

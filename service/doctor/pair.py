@@ -86,7 +86,7 @@ def check_images(encoded: EncodedQuery) -> tuple[Finding, Pair | None]:
     try:
         require_sizes(rgb, depth_m, camera)
     except ImageSizeError as error:
-        return _size_told(check, rgb, depth_m, camera) or Finding.of_error(check, error), None
+        return _size_finding(check, rgb, depth_m, camera) or Finding.of_error(check, error), None
     scale_m = default_scale_m(values.dtype, encoded.depth_encoding) if encoded.scale_m is None else encoded.scale_m
     pair = Pair(encoded, rgb, depth_m, bool(np.issubdtype(values.dtype, np.floating)), scale_m)
     text = f"colour {_size_of(rgb)}, depth {_size_of(depth_m)} of {values.dtype.name}"
@@ -95,20 +95,27 @@ def check_images(encoded: EncodedQuery) -> tuple[Finding, Pair | None]:
 
 def _depth_of(encoded: EncodedQuery) -> Depth:
     return decode_depth(
-        encoded.depth, camera=encoded.camera, encoding=encoded.depth_encoding, scale_m=encoded.scale_m, kind=encoded.depth_kind,
-        baseline_m=encoded.baseline_m, max_range_m=encoded.max_range_m,
-    )  # fmt: skip
+        encoded.depth,
+        camera=encoded.camera,
+        encoding=encoded.depth_encoding,
+        scale_m=encoded.scale_m,
+        kind=encoded.depth_kind,
+        baseline_m=encoded.baseline_m,
+        max_range_m=encoded.max_range_m,
+    )
 
 
-def _size_told(check: str, rgb: Rgb, depth_m: Depth, camera: PinholeCamera) -> Finding | None:
+def _size_finding(check: str, rgb: Rgb, depth_m: Depth, camera: PinholeCamera) -> Finding | None:
     """Say whether width and height are swapped, and in which of the three; None if they are not."""
     swapped = [name for name, image in (("colour", rgb), ("depth", depth_m)) if _is_swapped(image, camera)]
     sizes = f"colour {_size_of(rgb)}, depth {_size_of(depth_m)}, camera {camera.width}x{camera.height}"
     if swapped == ["colour", "depth"]:
         return Finding(
-            check, "problem", f"width and height of the camera file are swapped, or both images are rotated ({sizes})",
+            check,
+            "problem",
+            f"width and height of the camera file are swapped, or both images are rotated ({sizes})",
             "correct width and height, fx and fy, cx and cy; or rotate both images by 90 degrees",
-        )  # fmt: skip
+        )
     if swapped:
         image = f"the {swapped[0]} image"
         text = f"width and height of {image} are swapped: it is rotated relative to the camera ({sizes})"
@@ -149,15 +156,19 @@ def check_depth_unit(pair: Pair) -> tuple[Finding, Pair]:
         tried = pair.with_scale(pair.scale_m * factor)
         tried_m = _median_m(tried)
         if tried_m is not None and least_m <= tried_m <= most_m:
-            unit = _unit_told(pair, factor)
+            unit = _unit_hint(pair, factor)
             return Finding(
-                check, "problem", f"the median depth is {_plain(median_m)} m with depth.scale_m {pair.scale_m:g}{unit}",
+                check,
+                "problem",
+                f"the median depth is {_plain(median_m)} m with depth.scale_m {pair.scale_m:g}{unit}",
                 f"set depth.scale_m to {tried.scale_m:g}: the median is then {_plain(tried_m)} m, and the checks below use it",
-            ), tried  # fmt: skip
+            ), tried
     return Finding(
-        check, "warning", f"the median depth is {_plain(median_m)} m, but usual values are {least_m:g} to {most_m:g} m",
+        check,
+        "warning",
+        f"the median depth is {_plain(median_m)} m, but usual values are {least_m:g} to {most_m:g} m",
         "check depth.scale_m and depth.kind (z, range or disparity)",
-    ), pair  # fmt: skip
+    ), pair
 
 
 def _plain(number: float) -> str:
@@ -165,7 +176,7 @@ def _plain(number: float) -> str:
     return np.format_float_positional(number, precision=3, fractional=False, trim="-")
 
 
-def _unit_told(pair: Pair, factor: float) -> str:
+def _unit_hint(pair: Pair, factor: float) -> str:
     if pair.encoded.depth_kind == "disparity":
         return ""
     if pair.is_float and factor < 1:
@@ -192,6 +203,8 @@ def check_measured_share(pair: Pair) -> Finding:
     if share >= LEAST_SHARE:
         return Finding("depth share", "ok", text)
     return Finding(
-        "depth share", "warning" if share > 0 else "problem", text,
+        "depth share",
+        "warning" if share > 0 else "problem",
+        text,
         "check the range of the sensor, depth.max_range_m, and whether the lens is covered or the sun blinds it",
-    )  # fmt: skip
+    )

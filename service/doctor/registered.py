@@ -133,9 +133,11 @@ def check_registered(rgb: UInt8[NDArray[np.uint8], "H W 3"], depth_m: Float32[ND
         return Finding(check, "ok", f"{text}; no shift is clearly better")
     where = f"{_pixels(found.across_px, 'right', 'left')} and {_pixels(found.down_px, 'down', 'up')}"
     return Finding(
-        check, "warning", f"{text}, and {found.shifted:.0%} with the depth moved {where} (pixels of the colour image)",
+        check,
+        "warning",
+        f"{text}, and {found.shifted:.0%} with the depth moved {where} (pixels of the colour image)",
         "register the depth image to the colour camera, as the driver's option align_depth does, and send images with the same time stamp",
-    )  # fmt: skip
+    )
 
 
 def _pixels(shift_px: float, positive: str, negative: str) -> str:

@@ -99,11 +99,13 @@ class Georeference:
 def _east_north_up(latitude_deg: float, longitude_deg: float) -> Float64[NDArray[np.float64], "3 3"]:
     """Return the unit vectors east, north and up of a position as rows, in earth-centred axes."""
     b, l = np.deg2rad([latitude_deg, longitude_deg])  # noqa: E741  # geodesy's own letters
-    return np.array([
-        [-np.sin(l), np.cos(l), 0.0],
-        [-np.sin(b) * np.cos(l), -np.sin(b) * np.sin(l), np.cos(b)],
-        [np.cos(b) * np.cos(l), np.cos(b) * np.sin(l), np.sin(b)],
-    ])  # fmt: skip
+    return np.array(
+        [
+            [-np.sin(l), np.cos(l), 0.0],
+            [-np.sin(b) * np.cos(l), -np.sin(b) * np.sin(l), np.cos(b)],
+            [np.cos(b) * np.cos(l), np.cos(b) * np.sin(l), np.sin(b)],
+        ]
+    )
 
 
 def _earth_centred(latitude_deg: float, longitude_deg: float, height_m: float) -> Float64[NDArray[np.float64], "3"]:

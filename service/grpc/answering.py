@@ -36,9 +36,12 @@ def answering(
     try:
         context.send_initial_metadata(((REQUEST_ID, request_id),))
         yield Call(
-            engine.admission, context, span, timeout_s=engine.settings.request_timeout_s,
+            engine.admission,
+            context,
+            span,
+            timeout_s=engine.settings.request_timeout_s,
             hold=None if lives_long else held_by_call.get(),
-        )  # fmt: skip
+        )
     except StreetfixError as error:
         code = error.code
         refuse(context, error)
@@ -56,6 +59,10 @@ def answering(
         engine.metrics.requested("grpc", method, code, None if lives_long else seconds)
         span.end(method, code, failed=code in ("INTERNAL", "deadline"))
         log_request(
-            face="grpc", method=method, code=code, seconds=seconds, request_id=request_id,
+            face="grpc",
+            method=method,
+            code=code,
+            seconds=seconds,
+            request_id=request_id,
             traceparent=metadata.get("traceparent"),
-        )  # fmt: skip
+        )

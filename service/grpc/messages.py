@@ -26,19 +26,25 @@ _MODELS = {pb.CAMERA_MODEL_UNSPECIFIED: "PINHOLE", pb.CAMERA_MODEL_PINHOLE: "PIN
 #: One more than the contract allows. So too many coefficients are refused, and a message with millions does not become a large list.
 _MOST_COEFFICIENTS = 15
 _STATUS = {
-    "LOCALIZED": pb.LOCALIZATION_STATUS_LOCALIZED, "AMBIGUOUS": pb.LOCALIZATION_STATUS_AMBIGUOUS,
+    "LOCALIZED": pb.LOCALIZATION_STATUS_LOCALIZED,
+    "AMBIGUOUS": pb.LOCALIZATION_STATUS_AMBIGUOUS,
     "OUT_OF_MAP": pb.LOCALIZATION_STATUS_OUT_OF_MAP,
-}  # fmt: skip
+}
 _CALIBRATION = {
-    None: None, "in_range": pb.CALIBRATION_RANGE_IN_RANGE, "extrapolated": pb.CALIBRATION_RANGE_EXTRAPOLATED,
-}  # fmt: skip
+    None: None,
+    "in_range": pb.CALIBRATION_RANGE_IN_RANGE,
+    "extrapolated": pb.CALIBRATION_RANGE_EXTRAPOLATED,
+}
 _ORIGINS = {
-    "given": pb.CAMERA_HEIGHT_ORIGIN_GIVEN, "estimated": pb.CAMERA_HEIGHT_ORIGIN_ESTIMATED,
+    "given": pb.CAMERA_HEIGHT_ORIGIN_GIVEN,
+    "estimated": pb.CAMERA_HEIGHT_ORIGIN_ESTIMATED,
     "assumed": pb.CAMERA_HEIGHT_ORIGIN_ASSUMED,
-}  # fmt: skip
+}
 _SECTIONS = {
-    None: pb.STREET_SECTION_UNSPECIFIED, "beginning": pb.STREET_SECTION_BEGINNING, "end": pb.STREET_SECTION_END,
-}  # fmt: skip
+    None: pb.STREET_SECTION_UNSPECIFIED,
+    "beginning": pb.STREET_SECTION_BEGINNING,
+    "end": pb.STREET_SECTION_END,
+}
 
 
 def request_from(message: pb.LocalizeRequest) -> schema.LocalizeRequest:
@@ -85,19 +91,21 @@ def transform_from(message: pb.RigidTransform) -> schema.RigidTransform:
 def _of_all(message: pb.LocalizeRequest | pb.LocalizeSequenceRequest) -> dict[str, Any]:
     """Fields that a single pair and a sequence share."""
     return (
-        _given(message, "map") | _sub(message, "vehicle_from_camera", "T_vehicle_camera", transform_content)
+        _given(message, "map")
+        | _sub(message, "vehicle_from_camera", "T_vehicle_camera", transform_content)
         | {"vehicle_base_on_ground": message.vehicle_base_on_ground}
         | _sub(message, "prior", "prior", _prior)
         | _sub(message, "options", "options", lambda m: _given(m, "neighbours", "refine", "false_accept_rate"))
-    )  # fmt: skip
+    )
 
 
 def _of_pair(message: pb.LocalizeRequest | pb.SequenceFrame) -> dict[str, Any]:
     """Fields of one image pair."""
     return (
-        _sub(message, "camera", "camera", _camera) | _sub(message, "depth_format", "depth", _depth)
+        _sub(message, "camera", "camera", _camera)
+        | _sub(message, "depth_format", "depth", _depth)
         | _sub(message, "gravity", "gravity", _vector)
-    )  # fmt: skip
+    )
 
 
 def _camera(message: pb.Camera) -> dict[str, Any]:
@@ -125,10 +133,12 @@ def _prior(message: pb.Prior) -> dict[str, Any]:
         _given(message, "heading_deg", "heading_std_deg")
         | _sub(message, "position", "position", lambda m: {"x": m.x, "y": m.y} | _given(m, "std_m"))
         | _sub(
-            message, "wgs84", "wgs84",
+            message,
+            "wgs84",
+            "wgs84",
             lambda m: {"latitude_deg": m.latitude_deg, "longitude_deg": m.longitude_deg} | _given(m, "std_m"),
         )
-    )  # fmt: skip
+    )
 
 
 def transform_content(message: pb.RigidTransform) -> dict[str, Any]:
@@ -173,20 +183,32 @@ def answer_message(answer: schema.LocalizeAnswer) -> pb.LocalizeResponse:
         geopose=None if answer.geopose is None else _geopose(answer.geopose),
         neighbours=[
             pb.Neighbour(
-                place=each.place, distance=each.distance, similarity=each.similarity, street=each.street,
-                position=_vector3(each.position), heading_deg=each.heading_deg,
+                place=each.place,
+                distance=each.distance,
+                similarity=each.similarity,
+                street=each.street,
+                position=_vector3(each.position),
+                heading_deg=each.heading_deg,
             )
             for each in answer.neighbours
         ],
         camera_height=None if answer.camera_height is None else _camera_height(answer.camera_height),
         map=pb.MapVersion(name=answer.map.name, version=answer.map.version),
         timings=pb.Timings(
-            decode_ms=times.decode, fuse_ms=times.fuse, encode_ms=times.encode, search_ms=times.search,
-            register_ms=times.register_, total_ms=times.total,
+            decode_ms=times.decode,
+            fuse_ms=times.fuse,
+            encode_ms=times.encode,
+            search_ms=times.search,
+            register_ms=times.register_,
+            total_ms=times.total,
         ),
         hypotheses=[
             pb.Hypothesis(
-                pose=_pose(each.pose), share=each.share, inliers=each.inliers, similarity=each.similarity, confirmed=each.confirmed
+                pose=_pose(each.pose),
+                share=each.share,
+                inliers=each.inliers,
+                similarity=each.similarity,
+                confirmed=each.confirmed,
             )
             for each in answer.hypotheses
         ],
@@ -194,7 +216,12 @@ def answer_message(answer: schema.LocalizeAnswer) -> pb.LocalizeResponse:
         reasons=[pb.Reason(check=each.check, evidence=each.evidence, remedy=each.remedy) for each in answer.reasons],
         calibration=_CALIBRATION[answer.calibration],
         extrapolated=answer.extrapolated,
-    )  # fmt: skip
+        threshold=None
+        if answer.threshold is None
+        else pb.AcceptanceThreshold(
+            confidence=answer.threshold.confidence, false_accept_rate=answer.threshold.false_accept_rate
+        ),
+    )
     return message
 
 
@@ -220,24 +247,32 @@ def _geopose(geopose: schema.GeoPose) -> pb.GeoPose:
 
 def _street(street: schema.Street) -> pb.Street:
     return pb.Street(
-        id=street.id, name=street.name, street=street.street, section=_SECTIONS[street.section],
-        class_index=street.class_index, vote=street.vote,
-    )  # fmt: skip
+        id=street.id,
+        name=street.name,
+        street=street.street,
+        section=_SECTIONS[street.section],
+        class_index=street.class_index,
+        vote=street.vote,
+    )
 
 
 def _pose(pose: schema.Pose) -> pb.Pose:
     q = pose.orientation
     return pb.Pose(
-        position=_vector3(pose.position), orientation=pb.Quaternion(x=q.x, y=q.y, z=q.z, w=q.w), heading_deg=pose.heading_deg,
+        position=_vector3(pose.position),
+        orientation=pb.Quaternion(x=q.x, y=q.y, z=q.z, w=q.w),
+        heading_deg=pose.heading_deg,
         covariance=pose.covariance or (),
-    )  # fmt: skip
+    )
 
 
 def _spread(spread: schema.Spread) -> pb.Spread:
     return pb.Spread(
-        mean=_vector3(spread.mean), covariance=spread.covariance, heading_std_deg=spread.heading_std_deg,
+        mean=_vector3(spread.mean),
+        covariance=spread.covariance,
+        heading_std_deg=spread.heading_std_deg,
         hypotheses_weight=spread.hypotheses_weight,
-    )  # fmt: skip
+    )
 
 
 def _vector3(vector: schema.Vector) -> pb.Vector3:

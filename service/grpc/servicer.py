@@ -141,8 +141,8 @@ class Servicer(LocalizationServiceServicer):
         """
         with self._answering("GetCoverage", context):
             registry = self._engine.registry
-            asked = [registry.get(request.map)] if request.HasField("map") else list(registry)
-            return pb.GetCoverageResponse(geojson=coverage_geojson([localizer.bundle for localizer in asked]))
+            localizers = [registry.get(request.map)] if request.HasField("map") else list(registry)
+            return pb.GetCoverageResponse(geojson=coverage_geojson([localizer.bundle for localizer in localizers]))
 
     def _localize(self, request: pb.LocalizeRequest, span: RequestSpan) -> pb.LocalizeResponse:
         query = query_from(request_from(request), rgb=request.rgb, depth=request.depth)

@@ -9,7 +9,7 @@ from fastapi.openapi.utils import get_openapi
 from service.contract import schema
 from service.contract.oscp import GeoPoseRequest
 from service.http import problems, reference
-from service.http.body import Asking
+from service.http.body import RequestRunner
 from service.http.middleware import AllowedHosts, AuthMiddleware, HostMiddleware, RequestIdMiddleware
 from service.http.routes import answers, console, drawing, explain, health, localize, maps, oscp, samples
 from service.runtime.engine import Engine
@@ -32,15 +32,20 @@ def create_app(engine: Engine, keys: KeyRing | None = None) -> FastAPI:
     version = installed_version("streetfix")
     # Swagger UI and ReDoc are disabled, because they load scripts and styles from other hosts.
     app = FastAPI(
-        title="Streetfix", version=version, description=_DESCRIPTION, redirect_slashes=False, docs_url=None, redoc_url=None
-    )  # fmt: skip
-    asking = Asking(engine)
-    app.include_router(localize.router_for(asking))
-    app.include_router(oscp.router_for(asking))
+        title="Streetfix",
+        version=version,
+        description=_DESCRIPTION,
+        redirect_slashes=False,
+        docs_url=None,
+        redoc_url=None,
+    )
+    runner = RequestRunner(engine)
+    app.include_router(localize.router_for(runner))
+    app.include_router(oscp.router_for(runner))
     app.include_router(maps.router_for(engine))
     app.include_router(health.router_for(engine, version))
     if engine.settings.console:
-        for routes in (console.router_for(), drawing.router_for(asking), explain.router_for(asking)):
+        for routes in (console.router_for(), drawing.router_for(runner), explain.router_for(runner)):
             app.include_router(routes)
         for routes in (samples.router_for(engine.settings), answers.router_for(engine)):
             app.include_router(routes)

@@ -116,7 +116,7 @@ class Body:
         return content
 
 
-class Asking:
+class RequestRunner:
     """Reads bodies for an engine. All routes of an application share one.
 
     Args:
@@ -217,12 +217,12 @@ def require_parts(parts: dict[str, bytes], names: tuple[str, ...]) -> None:
     Raises:
         RequestError: a part is missing or unknown.
     """
-    told = f"send the parts {', '.join(names[:-1])} and {names[-1]}"
+    remedy = f"send the parts {', '.join(names[:-1])} and {names[-1]}"
     for name in names:
         if name not in parts:
-            raise RequestError(f"the part {name!r} is missing; {told}", field=name)
+            raise RequestError(f"the part {name!r} is missing; {remedy}", field=name)
     if unknown := sorted(set(parts) - set(names)):
-        raise RequestError(f"the part {unknown[0]!r} is unknown; {told}", field=unknown[0])
+        raise RequestError(f"the part {unknown[0]!r} is unknown; {remedy}", field=unknown[0])
 
 
 def document_of(parts: dict[str, bytes]) -> bytes:

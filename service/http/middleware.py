@@ -89,9 +89,13 @@ class RequestIdMiddleware:
             self._requested("rest", operation, str(status), seconds)
             span.end(operation, str(status), failed=status >= HTTPStatus.INTERNAL_SERVER_ERROR)
             log_request(
-                face="rest", method=operation, code=str(status), seconds=seconds, request_id=request_id,
+                face="rest",
+                method=operation,
+                code=str(status),
+                seconds=seconds,
+                request_id=request_id,
                 traceparent=headers.get("traceparent"),
-            )  # fmt: skip
+            )
 
 
 @dataclass(frozen=True, slots=True)
@@ -178,12 +182,12 @@ class AllowedHosts:
             host: value of the header ``Host`` of the same request.
         """
         scheme, _, rest = origin.partition("://")
-        asked, own = Authority.read(rest), Authority.read(host)
-        if scheme.lower() not in _DEFAULT_PORTS or asked is None or own is None:
+        source, own = Authority.read(rest), Authority.read(host)
+        if scheme.lower() not in _DEFAULT_PORTS or source is None or own is None:
             return False
         default = _DEFAULT_PORTS[scheme.lower()]
-        same = asked.host == own.host and (asked.port or default) == (own.port or default)
-        return same or self._lists(asked.host)
+        same = source.host == own.host and (source.port or default) == (own.port or default)
+        return same or self._lists(source.host)
 
     def _lists(self, name: str) -> bool:
         return any(name.endswith(each[1:]) if each.startswith("*.") else name == each for each in self.names)

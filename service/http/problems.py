@@ -118,10 +118,14 @@ def internal_error(error: Exception, request_id: str) -> Response:
     _log.error("request_failed request_id=%s", request_id, exc_info=error)
     error.__traceback__ = None
     problem = Problem(
-        type="/problems/internal", title="Internal error.", status=500,
+        type="/problems/internal",
+        title="Internal error.",
+        status=500,
         detail="The service failed on this request; report the request id to its operator.",
-        code="internal", field=None, request_id=request_id,
-    )  # fmt: skip
+        code="internal",
+        field=None,
+        request_id=request_id,
+    )
     return problem_response(problem)
 
 
@@ -143,10 +147,14 @@ async def _on_http(request: Request, error: Exception) -> Response:
     path = json.dumps(request.url.path[:200])
     code = CODE_OF_STATUS.get(error.status_code, "bad-request")
     problem = Problem(
-        type=f"/problems/{code}", title=HTTPStatus(error.status_code).phrase + ".", status=error.status_code,
+        type=f"/problems/{code}",
+        title=HTTPStatus(error.status_code).phrase + ".",
+        status=error.status_code,
         detail=f"{request.method} {path}: {error.detail}; see the API at /openapi.json",
-        code=code, field=None, request_id=request.state.request_id,
-    )  # fmt: skip
+        code=code,
+        field=None,
+        request_id=request.state.request_id,
+    )
     return problem_response(problem, error.headers)
 
 

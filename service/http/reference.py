@@ -20,9 +20,16 @@ HEADERS = {
 }
 _METHODS = ("get", "put", "post", "delete", "patch")
 _LIMITS = (
-    ("minimum", ">="), ("exclusiveMinimum", ">"), ("maximum", "<="), ("exclusiveMaximum", "<"), ("minLength", "length >="),
-    ("maxLength", "length <="), ("minItems", "items >="), ("maxItems", "items <="), ("pattern", "pattern"),
-)  # fmt: skip
+    ("minimum", ">="),
+    ("exclusiveMinimum", ">"),
+    ("maximum", "<="),
+    ("exclusiveMaximum", "<"),
+    ("minLength", "length >="),
+    ("maxLength", "length <="),
+    ("minItems", "items >="),
+    ("maxItems", "items <="),
+    ("pattern", "pattern"),
+)
 _STYLE = """
 :root { color-scheme: light dark; font: 16px/1.5 system-ui, sans-serif }
 body { max-width: 62rem; margin: 2rem auto; padding: 0 1rem }
@@ -98,9 +105,9 @@ def _operation(name: str, operation: dict[str, Any]) -> str:
             _row(
                 f"<code>{escape(label)}</code> ({escape(where)})",
                 _type(schema),
-                _told(schema, required=required, told=told),
+                _description(schema, required=required, description=description),
             )
-            for label, where, schema, required, told in rows
+            for label, where, schema, required, description in rows
         )
         parts.append(_table(("parameter", "type", "meaning"), lines))
     for media, content in operation.get("requestBody", {}).get("content", {}).items():
@@ -140,7 +147,7 @@ def _properties(schema: dict[str, Any]) -> str:
         _row(
             f"<code>{escape(name)}</code>",
             _type(each),
-            _told(each, required=name in required, told=each.get("description", "")),
+            _description(each, required=name in required, description=each.get("description", "")),
         )
         for name, each in schema.get("properties", {}).items()
     ]
@@ -164,12 +171,12 @@ def _type(schema: dict[str, Any]) -> str:
     return escape(str(schema.get("format") or schema.get("type") or "any value"))
 
 
-def _told(schema: dict[str, Any], *, required: bool, told: str) -> str:
+def _description(schema: dict[str, Any], *, required: bool, description: str) -> str:
     """Describe the meaning, the limits and the default of a field."""
     limits = [
         f"{sign} {limit[key]}" for limit in (schema, *schema.get("anyOf", [])) for key, sign in _LIMITS if key in limit
     ]
-    words = [escape(told)] if told else []
+    words = [escape(description)] if description else []
     words += [f"<code>{escape(', '.join(limits))}</code>"] if limits else []
     words += ["required"] if required else []
     default = schema.get("default")

@@ -20,15 +20,15 @@ const LayoutEntry streetfix_layout[] = {
 };
 
 /* Projects each ray of a block into an image: flat index of the pixel, -1 outside. Rounds half to even, like rint. */
-static void pixels(const float *x, const float *y, const float *z, int64_t count, const Picture *p, int32_t *index)
+static void project(const float *x, const float *y, const float *z, int64_t count, const Picture *p, int32_t *index)
 {
     const float fx = (float)p->fx, fy = (float)p->fy, cx = (float)p->cx, cy = (float)p->cy;
     const float w = (float)p->width, h = (float)p->height;
     const float magic = 12582912.0f; /* 1.5 * 2^23: a float of this size has no fractional bits, so adding it rounds */
     const int32_t width = (int32_t)p->width;
     for (int64_t i = 0; i < count; i++) {
-        const int ahead = z[i] > 1e-3f;
-        const float inverse = 1.0f / (ahead ? z[i] : 1.0f);
+        const int in_front = z[i] > 1e-3f;
+        const float inverse = 1.0f / (in_front ? z[i] : 1.0f);
         float u = x[i] * inverse * fx + cx, v = y[i] * inverse * fy + cy;
         u = u > -2.0f ? u : -2.0f;
         u = u < w + 2.0f ? u : w + 2.0f;
@@ -36,12 +36,12 @@ static void pixels(const float *x, const float *y, const float *z, int64_t count
         v = v < h + 2.0f ? v : h + 2.0f;
         u = (u + magic) - magic;
         v = (v + magic) - magic;
-        const int inside = ahead & (u >= 0.0f) & (u < w) & (v >= 0.0f) & (v < h);
+        const int inside = in_front & (u >= 0.0f) & (u < w) & (v >= 0.0f) & (v < h);
         index[i] = inside ? (int32_t)v * width + (int32_t)u : -1;
     }
 }
 
-static void order(float *a, float *b, int64_t count)
+static void sort_pairs(float *a, float *b, int64_t count)
 {
     for (int64_t i = 0; i < count; i++) {
         const float low = a[i] < b[i] ? a[i] : b[i], high = a[i] < b[i] ? b[i] : a[i];
@@ -63,12 +63,12 @@ void streetfix_gather(const float *rays, int64_t cells, const double *R, const f
 {
     float r[9];
     for (int k = 0; k < 9; k++) r[k] = (float)R[k];
-    const int same = memcmp(depth_picture, rgb_picture, sizeof(Picture)) == 0;
-    const float least = (float)min_range, most = (float)max_range;
+    const int same_picture = memcmp(depth_picture, rgb_picture, sizeof(Picture)) == 0;
+    const float nearest = (float)min_range, farthest = (float)max_range;
     for (int64_t first = 0; first < cells; first += BLOCK) {
         const int64_t count = cells - first < BLOCK ? cells - first : BLOCK;
         float distance[SAMPLES][BLOCK], x[BLOCK], y[BLOCK], z[BLOCK];
-        int32_t at[BLOCK], at_rgb[BLOCK], measured[BLOCK], coloured[BLOCK], sum[3][BLOCK];
+        int32_t depth_pixel[BLOCK], rgb_pixel[BLOCK], measured[BLOCK], coloured[BLOCK], sum[3][BLOCK];
         memset(measured, 0, sizeof measured);
         memset(coloured, 0, sizeof coloured);
         memset(sum, 0, sizeof sum);
@@ -80,23 +80,23 @@ void streetfix_gather(const float *rays, int64_t cells, const double *R, const f
                 y[i] = r[3] * lx[i] + r[4] * ly[i] + r[5] * lz[i];
                 z[i] = r[6] * lx[i] + r[7] * ly[i] + r[8] * lz[i];
             }
-            pixels(x, y, z, count, depth_picture, at);
-            if (!same) pixels(x, y, z, count, rgb_picture, at_rgb);
-            const int32_t *of_colour = same ? at : at_rgb;
+            project(x, y, z, count, depth_picture, depth_pixel);
+            if (!same_picture) project(x, y, z, count, rgb_picture, rgb_pixel);
+            const int32_t *colour_pixel = same_picture ? depth_pixel : rgb_pixel;
             for (int64_t i = 0; i < count; i++) {
-                float found = INFINITY;
-                if (at[i] >= 0) {
+                float range = INFINITY;
+                if (depth_pixel[i] >= 0) {
                     seen[first + i] = 1;
                     /* Range from depth: the unit ray has the z component z[i]. */
-                    const float d = depth[at[i]] / z[i];
-                    if (d >= least && d <= most) {
-                        found = d;
+                    const float d = depth[depth_pixel[i]] / z[i];
+                    if (d >= nearest && d <= farthest) {
+                        range = d;
                         measured[i]++;
                     }
                 }
-                distance[s][i] = found;
-                if (of_colour[i] >= 0) {
-                    const uint8_t *pixel = rgb + 3 * (int64_t)of_colour[i];
+                distance[s][i] = range;
+                if (colour_pixel[i] >= 0) {
+                    const uint8_t *pixel = rgb + 3 * (int64_t)colour_pixel[i];
                     sum[0][i] += pixel[0];
                     sum[1][i] += pixel[1];
                     sum[2][i] += pixel[2];
@@ -104,12 +104,12 @@ void streetfix_gather(const float *rays, int64_t cells, const double *R, const f
                 }
             }
         }
-        for (int k = 0; k < 25; k++) order(distance[NETWORK[k][0]], distance[NETWORK[k][1]], count);
+        for (int k = 0; k < 25; k++) sort_pairs(distance[NETWORK[k][0]], distance[NETWORK[k][1]], count);
         for (int64_t i = 0; i < count; i++) {
-            const int32_t many = measured[i];
-            ranges[first + i] = many >= fewest && many > 0 ? distance[(many - 1) / 2][i] : 0.0f;
-            const float by = (float)(coloured[i] > 0 ? coloured[i] : 1);
-            for (int c = 0; c < 3; c++) colour[3 * (first + i) + c] = (float)sum[c][i] / by;
+            const int32_t measured_count = measured[i];
+            ranges[first + i] = measured_count >= fewest && measured_count > 0 ? distance[(measured_count - 1) / 2][i] : 0.0f;
+            const float divisor = (float)(coloured[i] > 0 ? coloured[i] : 1);
+            for (int c = 0; c < 3; c++) colour[3 * (first + i) + c] = (float)sum[c][i] / divisor;
         }
     }
 }

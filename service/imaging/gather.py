@@ -87,10 +87,20 @@ def gather(
     ranges, colour = np.empty(cells, np.float32), np.empty((cells, 3), np.float32)
     seen = np.empty(cells, np.bool_)
     _library().streetfix_gather(
-        rays.ctypes.data, cells, R.ctypes.data, depth_m.ctypes.data, byref(c_picture(camera, depth_m)), rgb.ctypes.data,
-        byref(c_picture(camera, rgb)), grid.min_range_m, grid.max_range_m, FEWEST_SAMPLES, ranges.ctypes.data, colour.ctypes.data,
+        rays.ctypes.data,
+        cells,
+        R.ctypes.data,
+        depth_m.ctypes.data,
+        byref(c_picture(camera, depth_m)),
+        rgb.ctypes.data,
+        byref(c_picture(camera, rgb)),
+        grid.min_range_m,
+        grid.max_range_m,
+        FEWEST_SAMPLES,
+        ranges.ctypes.data,
+        colour.ctypes.data,
         seen.ctypes.data,
-    )  # fmt: skip
+    )
     shape = (grid.rows, grid.columns)
     return ranges.reshape(shape), colour.reshape(*shape, 3), seen.reshape(shape)
 

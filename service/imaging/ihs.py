@@ -14,11 +14,13 @@ from numpy.typing import NDArray
 F = TypeVar("F", np.float32, np.float64)
 
 #: Matrix with rows I, V1, V2 (eq. 9). The rows are orthonormal, so the inverse is the transpose.
-IHS_FROM_RGB: NDArray[np.float64] = np.array([
-    [1 / np.sqrt(3), 1 / np.sqrt(3), 1 / np.sqrt(3)],
-    [-1 / np.sqrt(6), -1 / np.sqrt(6), 2 / np.sqrt(6)],
-    [-1 / np.sqrt(2), 1 / np.sqrt(2), 0.0],
-])  # fmt: skip
+IHS_FROM_RGB: NDArray[np.float64] = np.array(
+    [
+        [1 / np.sqrt(3), 1 / np.sqrt(3), 1 / np.sqrt(3)],
+        [-1 / np.sqrt(6), -1 / np.sqrt(6), 2 / np.sqrt(6)],
+        [-1 / np.sqrt(2), 1 / np.sqrt(2), 0.0],
+    ]
+)
 
 
 def ihs_linear(

@@ -15,7 +15,7 @@ typedef struct {
 } Ground;
 
 typedef struct {
-    double x, y, z, reach, certainty;
+    double x, y, z, reach, weight;
 } Point;
 
 /* Compared with Python's structures when the library is loaded. */
@@ -26,7 +26,7 @@ const LayoutEntry streetfix_layout[] = {
     LAYOUT_FIELD(Ground, height_m), LAYOUT_FIELD(Ground, tilt_prior), LAYOUT_FIELD(Ground, height_prior_m),
     LAYOUT_FIELD(Ground, noise_m), LAYOUT_FIELD(Ground, noise_per_m), LAYOUT_FIELD(Ground, correlated),
     LAYOUT_STRUCT(Point), LAYOUT_FIELD(Point, x), LAYOUT_FIELD(Point, y), LAYOUT_FIELD(Point, z),
-    LAYOUT_FIELD(Point, reach), LAYOUT_FIELD(Point, certainty),
+    LAYOUT_FIELD(Point, reach), LAYOUT_FIELD(Point, weight),
     LAYOUT_END,
 };
 /* clang-format on */
@@ -61,7 +61,7 @@ static void solve(double H[3][3], const double g[3], double s[3])
 void streetfix_fit_ground(const float *depth, const Picture *p, int64_t step, const double *R, const Ground *o, const double *bands,
                           int64_t rounds, Point *points, double *out)
 {
-    int64_t count = 0, measured = 0, on = 0, below = 0;
+    int64_t count = 0, measured = 0, on_plane = 0, below = 0;
     for (int64_t v = step / 2; v < p->height; v += step)
         for (int64_t u = step / 2; u < p->width; u += step) {
             const double z = (double)depth[v * p->width + u];
@@ -76,7 +76,7 @@ void streetfix_fit_ground(const float *depth, const Picture *p, int64_t step, co
             q->z = up;
             q->reach = hypot(q->x, q->y);
             const double noise = o->noise_m + o->noise_per_m * q->reach;
-            q->certainty = 1.0 / (noise * noise * o->correlated);
+            q->weight = 1.0 / (noise * noise * o->correlated);
         }
     out[0] = out[1] = 0.0;
     out[2] = -o->height_m;
@@ -86,10 +86,10 @@ void streetfix_fit_ground(const float *depth, const Picture *p, int64_t step, co
         int64_t kept = 0;
         for (int64_t i = 0; i < count; i++) {
             const Point *q = points + i;
-            const double off = q->z - (q->x * out[0] + q->y * out[1] + out[2]);
+            const double residual = q->z - (q->x * out[0] + q->y * out[1] + out[2]);
             const double band = bands[3 * k] + bands[3 * k + 1] * q->reach;
-            if (!(off > -band && off < bands[3 * k + 2] * band)) continue;
-            const double w = q->certainty, wx = w * q->x, wy = w * q->y;
+            if (!(residual > -band && residual < bands[3 * k + 2] * band)) continue;
+            const double w = q->weight, wx = w * q->x, wy = w * q->y;
             H[0][0] += wx * q->x;
             H[1][0] += wy * q->x;
             H[1][1] += wy * q->y;
@@ -106,12 +106,12 @@ void streetfix_fit_ground(const float *depth, const Picture *p, int64_t step, co
     }
     for (int64_t i = 0; i < count; i++) {
         const Point *q = points + i;
-        const double off = q->z - (q->x * out[0] + q->y * out[1] + out[2]);
+        const double residual = q->z - (q->x * out[0] + q->y * out[1] + out[2]);
         const double band = bands[3 * rounds - 3] + bands[3 * rounds - 2] * q->reach;
-        on += fabs(off) <= band;
-        below += off < -3 * band;
+        on_plane += fabs(residual) <= band;
+        below += residual < -3 * band;
     }
     out[3] = (double)measured;
-    out[4] = (double)on;
+    out[4] = (double)on_plane;
     out[5] = (double)below;
 }

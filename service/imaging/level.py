@@ -54,9 +54,17 @@ CORRELATED = 15.0
 #: Inlier band around the plane of the previous round, one row (a, b, c) per round. At the horizontal distance r, a point may lie
 #: a + b * r below the plane and c * (a + b * r) above it (metres). The last bands are narrow, and narrower above. Otherwise
 #: pavements would tilt the plane by half a degree, because they lie a kerb above the road and further ahead (decision 0081).
-BANDS = np.array([
-    (0.5, 0.08, 1.0), (0.35, 0.05, 1.0), (0.25, 0.03, 1.0), (0.11, 0.016, 0.7), (0.08, 0.012, 0.7), (0.06, 0.008, 0.7), (0.06, 0.008, 0.7),
-])  # fmt: skip
+BANDS = np.array(
+    [
+        (0.5, 0.08, 1.0),
+        (0.35, 0.05, 1.0),
+        (0.25, 0.03, 1.0),
+        (0.11, 0.016, 0.7),
+        (0.08, 0.012, 0.7),
+        (0.06, 0.008, 0.7),
+        (0.06, 0.008, 0.7),
+    ]
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -209,15 +217,23 @@ class _Ground(Structure):
 
 
 #: Ground point in the work buffer of the fit: position in the nominal level frame (m), horizontal distance (m), weight (1/m^2).
-_POINT = np.dtype([(name, "<f8") for name in ("x", "y", "z", "reach", "certainty")])
+_POINT = np.dtype([(name, "<f8") for name in ("x", "y", "z", "reach", "weight")])
 
 
 @cache
 def _library() -> ctypes.CDLL:
     library = load(LIBRARY, {"Picture": CPicture, "Ground": _Ground, "Point": _POINT})
     library.streetfix_fit_ground.argtypes = [
-        c_void_p, POINTER(CPicture), c_int64, c_void_p, POINTER(_Ground), c_void_p, c_int64, c_void_p, c_void_p,
-    ]  # fmt: skip
+        c_void_p,
+        POINTER(CPicture),
+        c_int64,
+        c_void_p,
+        POINTER(_Ground),
+        c_void_p,
+        c_int64,
+        c_void_p,
+        c_void_p,
+    ]
     library.streetfix_fit_ground.restype = None
     return library
 
@@ -241,10 +257,26 @@ def _fit_ground(
     step = max(1, width // STEP_PIXELS)
     found, points = np.empty(6), np.empty(-(-height // step) * -(-width // step), _POINT)
     _library().streetfix_fit_ground(
-        depth_m.ctypes.data, byref(c_picture(camera, depth_m)), step, R.ctypes.data,
-        byref(_Ground(
-            NEAR_M, REACH_M, 0.3 * height_m, height_m, TILT_PRIOR_RAD, height_std_m, NOISE_M, NOISE_PER_M, CORRELATED
-        )),
-        BANDS.ctypes.data, len(BANDS), points.ctypes.data, found.ctypes.data,
-    )  # fmt: skip
+        depth_m.ctypes.data,
+        byref(c_picture(camera, depth_m)),
+        step,
+        R.ctypes.data,
+        byref(
+            _Ground(
+                NEAR_M,
+                REACH_M,
+                0.3 * height_m,
+                height_m,
+                TILT_PRIOR_RAD,
+                height_std_m,
+                NOISE_M,
+                NOISE_PER_M,
+                CORRELATED,
+            )
+        ),
+        BANDS.ctypes.data,
+        len(BANDS),
+        points.ctypes.data,
+        found.ctypes.data,
+    )
     return tuple(found.tolist())

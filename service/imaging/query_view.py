@@ -82,9 +82,16 @@ def query_view(
         NoDepthError: no cell of the grid holds a measurement (raised by ``query_views``).
     """
     views = query_views(
-        rgb, depth_m, camera, grid=grid, rows_seen=rows_seen, turns=(0,), turn_rad=turn_rad,
-        down_camera=down_camera, given_height=given_height,
-    )  # fmt: skip
+        rgb,
+        depth_m,
+        camera,
+        grid=grid,
+        rows_seen=rows_seen,
+        turns=(0,),
+        turn_rad=turn_rad,
+        down_camera=down_camera,
+        given_height=given_height,
+    )
     return QueryView(views.planes[0], views.R_level_camera, views.height_m, views.measured_share)
 
 

@@ -13,6 +13,7 @@ from service.confidence.spread import Spread
 from service.errors import NotFiniteError
 from service.geometry.rigid import Transform
 from service.imaging.level import HeightOrigin
+from service.maps.calibration import Threshold
 from service.retrieval.hypotheses import Hypothesis
 from service.retrieval.knn import Neighbour, StreetVote
 from service.scoring.candidates import Candidate
@@ -67,6 +68,7 @@ class Answer:
             confidence features lie in the range of the calibration data.
         extrapolated: confidence features outside the range of the calibration data: name, and signed distance from its mean in
             standard deviations, the farthest first. The confidence is an extrapolation then.
+        threshold: the threshold that decided the status, with its false-accept rate; None if ``confidence`` is None.
         frames: number of image pairs in the query.
         evidence: confidence features, in the order of ``service.confidence.features.FEATURES``; None without registration.
         T_map_vehicle_guess: best guess of the vehicle pose; None if the query does not give the camera's pose on the vehicle.
@@ -89,6 +91,7 @@ class Answer:
     spread: Spread | None
     reasons: tuple[Reason, ...]
     extrapolated: tuple[tuple[str, float], ...]
+    threshold: Threshold | None
     frames: int
     evidence: Float64[NDArray[np.float64], " F"] | None
     T_map_vehicle_guess: Transform | None

@@ -21,9 +21,14 @@ VERIFIED_M = 5.0
 
 
 def compose(
-    bundle: MapBundle, frames: tuple[Frame, ...], retrieved: Retrieved, refined: Refined | None,
-    evidence: Float64[NDArray[np.float64], " F"] | None, outcome: Outcome, timer: StageTimer,
-) -> Answer:  # fmt: skip
+    bundle: MapBundle,
+    frames: tuple[Frame, ...],
+    retrieved: Retrieved,
+    refined: Refined | None,
+    evidence: Float64[NDArray[np.float64], " F"] | None,
+    outcome: Outcome,
+    timer: StageTimer,
+) -> Answer:
     """Build an answer from the results of all stages.
 
     Args:
@@ -40,7 +45,7 @@ def compose(
     """
     query, views, heaviest = frames[0].query, frames[0].views, retrieved.hypotheses[0]
     T_map_camera = _pose_of(bundle, heaviest, views) if refined is None else refined.best.T_map_camera
-    told = max(query.neighbours, query.ranked)
+    count = max(query.neighbours, query.ranked)
     answer = Answer(
         status=outcome.status,
         confidence=outcome.confidence,
@@ -52,10 +57,11 @@ def compose(
         spread=outcome.spread,
         reasons=outcome.reasons,
         extrapolated=outcome.extrapolated,
+        threshold=outcome.threshold,
         frames=len(frames),
         evidence=evidence,
         T_map_vehicle_guess=None if query.T_vehicle_camera is None else T_map_camera @ inverse(query.T_vehicle_camera),
-        neighbours=reranked(retrieved.neighbours, outcome.candidates or ())[:told],
+        neighbours=reranked(retrieved.neighbours, outcome.candidates or ())[:count],
         hypotheses=retrieved.hypotheses,
         measured_share=views.measured_share,
         height_m=views.height_m,

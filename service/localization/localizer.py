@@ -35,8 +35,13 @@ class Localizer:
     """
 
     def __init__(
-        self, bundle: MapBundle, encoder: Encoder, *, clusters: ClusterSettings | None = None, refining: RefineSettings | None = None
-    ) -> None:  # fmt: skip
+        self,
+        bundle: MapBundle,
+        encoder: Encoder,
+        *,
+        clusters: ClusterSettings | None = None,
+        refining: RefineSettings | None = None,
+    ) -> None:
         require_encoder_of(bundle, encoder)
         require_features(bundle.calibration, str(bundle.path))
         self.bundle = bundle

@@ -8,7 +8,15 @@ from numpy.typing import NDArray
 
 from service.geometry.rigid import heading_of_camera, transform_from
 from service.maps.reader import MapBundle
-from service.registration.covariance import OF_POINTS, OF_RAYS, covariance_of, disagreement, score_outer_product
+from service.registration.covariance import (
+    OF_POINTS,
+    OF_RAYS,
+    covariance_of,
+    disagreement,
+    rectification_covariance,
+    score_outer_product,
+    survey_covariance,
+)
 from service.registration.local_search import LocalSearchSettings, search_locally
 from service.registration.points import FOCAL_BASELINE_PX_M, PointSettings
 from service.registration.rays import RaySettings, adjust
@@ -63,12 +71,14 @@ def settings_for_rig(settings: RefineSettings, focal_baseline_px_m: float) -> Re
     """
     registration = settings.registration
     return replace(
-        settings, focal_baseline_px_m=focal_baseline_px_m,
+        settings,
+        focal_baseline_px_m=focal_baseline_px_m,
         registration=replace(
-            registration, middle=replace(registration.middle, free_offset=True, offset=OFFSET_PX),
+            registration,
+            middle=replace(registration.middle, free_offset=True, offset=OFFSET_PX),
             fine=replace(registration.fine, free_offset=True, offset=OFFSET_PX),
         ),
-    )  # fmt: skip
+    )
 
 
 #: Standard deviation of a rig's disparity offset, px. With SGBM the offset was 0.1 to 0.46 px on real frames (feasibility study).
@@ -100,16 +110,22 @@ def refine(
         return None
     # 2. Starts, and registration of each from coarse to fine.
     starts = starts_from(
-        frames, prior, lidar_height_m=bundle.manifest.lidar_height_m, settings=settings.starts,
+        frames,
+        prior,
+        lidar_height_m=bundle.manifest.lidar_height_m,
+        settings=settings.starts,
         likeness=None if len(frames) == 1 else lambda T_map_level: similarity_of(bundle, measured, T_map_level)[0],
-    )  # fmt: skip
+    )
     found = register(cloud, points, starts, reference.views.height_m, settings.registration)
     # 3. Scores, and other local minima around the best pose.
-    sights = SurfelRaycaster(cloud, settings.rays)
+    raycaster = SurfelRaycaster(cloud, settings.rays)
     scorer = PoseScorer(
-        measured, scorers_of(bundle, cloud, measured, prior, settings.support),
-        BrightnessScorer(sights, measured, settings.photometry), settings.support, settings.near,
-    )  # fmt: skip
+        measured,
+        scorers_of(bundle, cloud, measured, prior, settings.support),
+        BrightnessScorer(raycaster, measured, settings.photometry),
+        settings.support,
+        settings.near,
+    )
     candidates = scorer.with_brightness(scorer.candidates(found))
     independent = float(np.median([frame.independent_noise for frame in frames]))
     if scorer.brightness.is_known and independent >= settings.around.from_noise:
@@ -119,7 +135,7 @@ def refine(
         candidates[0] = scorer.select_local_optimum(candidates[0], near)
     # 4. Adjustment of the best pose along the rays, and its covariance.
     best = candidates[0].registered
-    adjusted = adjust(sights, [each.picture for each in measured], best, settings.rays)
+    adjusted = adjust(raycaster, [each.picture for each in measured], best, settings.rays)
     if adjusted is None:
         scatter, model = score_outer_product(cloud, points, best, settings.registration), OF_POINTS
     else:
@@ -128,12 +144,23 @@ def refine(
         candidates[0] = replace(candidates[0], T_map_camera=T_map_camera, registered=best)
     noise = float(np.median([frame.noise for frame in frames]))
     heading = heading_of_camera(candidates[0].T_map_camera)
-    covariance = covariance_of(best.information, scatter, noise, heading, model)
-    candidates[0] = replace(candidates[0], covariance=covariance)
+    of_registration = covariance_of(best.information, scatter, noise, heading, model)
+    systematic = survey_covariance(*bundle.manifest.survey_std)
+    if rig_px_m is not None:
+        systematic = systematic + rectification_covariance()
+    candidates[0] = replace(candidates[0], covariance=of_registration + systematic)
 
     def covariance_at(candidate: Candidate) -> Float64[NDArray[np.float64], "6 6"]:
         pose = candidate.registered
-        pulled = score_outer_product(cloud, points, pose, settings.registration)
-        return covariance_of(pose.information, pulled, noise, heading_of_camera(candidate.T_map_camera), OF_POINTS)
+        scatter_at = score_outer_product(cloud, points, pose, settings.registration)
+        heading_at = heading_of_camera(candidate.T_map_camera)
+        return covariance_of(pose.information, scatter_at, noise, heading_at, OF_POINTS) + systematic
 
-    return Refined(tuple(candidates), covariance, len(points), disagreement(best.information, scatter), covariance_at)
+    return Refined(
+        candidates=tuple(candidates),
+        covariance=of_registration + systematic,
+        registration_covariance=of_registration,
+        points=len(points),
+        disagreement=disagreement(best.information, scatter),
+        covariance_at=covariance_at,
+    )

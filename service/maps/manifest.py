@@ -129,6 +129,11 @@ class Manifest(_Frozen):
         """Nominal height of the survey's LiDAR above the ground, metres. The LiDAR is the origin of a place."""
         return self.parameters["lidar_height_m"]
 
+    @property
+    def survey_std(self) -> tuple[float | None, float | None]:
+        """Standard deviations of the survey's positions (metres) and angles (degrees); None if the map does not state them."""
+        return self.parameters.get("survey_position_std_m"), self.parameters.get("survey_angle_std_deg")
+
     def expected_version(self) -> str:
         """Return the version: the first 16 hexadecimal digits of the SHA-256 of the content.
 

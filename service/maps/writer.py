@@ -5,7 +5,7 @@ import json
 import os
 import shutil
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import asdict
 from datetime import UTC, datetime
 from pathlib import Path
@@ -56,6 +56,59 @@ def write_bundle(out: Path, content: BundleContent, *, overwrite: bool = False) 
         if partial is not None and partial.exists():
             shutil.rmtree(partial, ignore_errors=True)
     return made
+
+
+def replace_calibration(bundle: Path, calibration: Mapping[str, Any]) -> Manifest:
+    """Replace the calibration of a bundle atomically and return the new manifest.
+
+    The map gets a new version, so a running service mounts it as one. The function writes a second bundle beside the first and renames it
+    into place, as ``write_bundle`` does. All other files are hard links, or copies where the file system has no links. A process that has
+    the old bundle open keeps it.
+
+    Args:
+        bundle: the bundle's folder.
+        calibration: content of ``calibration.json``.
+
+    Raises:
+        BundleError: the bundle has no valid manifest, or the file system reports an error.
+    """
+    old, place = manifest.read_manifest(bundle), bundle.resolve()
+    partial: Path | None = None
+    try:
+        partial = Path(tempfile.mkdtemp(prefix=f".{place.name}.", suffix=".partial", dir=place.parent))
+        for name in sorted(old.files):
+            (partial / name).parent.mkdir(exist_ok=True, parents=True)
+            if name != parts.CALIBRATION_FILE:
+                _link_or_copy(place / name, partial / name)
+        written = partial / parts.CALIBRATION_FILE
+        written.write_bytes(_json(calibration))
+        _sync(written)
+        entry = FileEntry(sha256=sha256_of(written), size=written.stat().st_size)
+        files = {**old.files, parts.CALIBRATION_FILE: entry}
+        made = old.model_copy(update={"files": files, "made_at": datetime.now(UTC)}).stamped()
+        (partial / manifest.FILE).write_bytes(made.to_bytes())
+        _sync(partial / manifest.FILE)
+        for folder in {(partial / name).parent for name in old.files}:
+            _sync(folder)
+        shutil.copymode(place, partial)
+        _sync(partial)
+        _put_in_place(partial, place)
+    except OSError as error:
+        raise BundleError(
+            f"{bundle}: the calibration cannot be replaced ({error.strerror}); free disk space, or get write access to {place.parent}"
+        ) from error
+    finally:
+        if partial is not None and partial.exists():
+            shutil.rmtree(partial, ignore_errors=True)
+    return made
+
+
+def _link_or_copy(source: Path, target: Path) -> None:
+    try:
+        os.link(source.resolve(), target)
+    except OSError:  # a file system without hard links; a copy fails with its own error if the disk is the reason
+        shutil.copyfile(source, target)
+        _sync(target)
 
 
 def _write_files(folder: Path, content: BundleContent) -> Manifest:
@@ -189,11 +242,12 @@ def _put_in_place(partial: Path, out: Path) -> None:
         partial.rename(out)
     else:
         aside = Path(tempfile.mkdtemp(prefix=f".{out.name}.", suffix=".replaced", dir=out.parent))
-        out.rename(aside / out.name)
         try:
+            out.rename(aside / out.name)
             partial.rename(out)
-        except OSError:
-            (aside / out.name).rename(out)
+        except BaseException:  # also Ctrl-C: the old bundle must not be lost
+            if not out.exists():
+                (aside / out.name).rename(out)
             raise
         finally:
             shutil.rmtree(aside, ignore_errors=True)

@@ -7,7 +7,7 @@ from jaxtyping import Float32, Float64, Int32
 from numpy.typing import NDArray
 
 from service.geometry.rigid import rotation_z
-from service.registration.kernel import STATE, UNKNOWNS, QueryPoints, pulls
+from service.registration.kernel import STATE, UNKNOWNS, QueryPoints, gradients
 from service.registration.register import Registered, RegistrationSettings
 from service.registration.surfel_map import SurfelMap
 
@@ -22,7 +22,7 @@ _PRIOR_SIGMA = np.array([30.0, 30.0, 0.3, *np.deg2rad([2.0, 2.0, 10.0]), 0.01, 0
 PATCH_RAD = 0.2
 #: Least eigenvalue of the normalised information (unit diagonal) of an observable direction. For comparison: a wall's distance against
 #: the scale has 4e-6.
-_TOLD = 1e-4
+_OBSERVABLE = 1e-4
 #: Least disagreement. Its logarithm is a confidence feature, so it must not be 0.
 _LEAST = 1e-6
 
@@ -52,20 +52,63 @@ class CovarianceModel:
 
 #: Model for poses that ``register`` found from points. Fitted on calibration cities (decisions 0042 and 0081).
 OF_POINTS = CovarianceModel(
-    independent=2.25, independent_power=0.52, shared=2.4, axes=(1.0, 1.0, 1.12, 0.8, 0.8, 1.0),
-    axes_power=(0.0, 0.0, -0.3, -0.22, -0.22, 0.03), floor=(0.025, 0.025, 0.017, 0.03, 0.03, 0.05),
-)  # fmt: skip
+    independent=2.25,
+    independent_power=0.52,
+    shared=2.4,
+    axes=(1.0, 1.0, 1.12, 0.8, 0.8, 1.0),
+    axes_power=(0.0, 0.0, -0.3, -0.22, -0.22, 0.03),
+    floor=(0.025, 0.025, 0.017, 0.03, 0.03, 0.05),
+)
 #: Model for poses that ``adjust`` refined along the rays. Fitted on calibration cities (decisions 0098 and 0100).
 OF_RAYS = CovarianceModel(
-    independent=1.17, independent_power=0.52, shared=2.97, axes=(1.42, 0.91, 0.73, 0.8, 0.8, 1.05),
-    axes_power=(0.05, 0.0, -0.18, -0.22, -0.22, -0.04), floor=(0.022, 0.022, 0.0175, 0.028, 0.028, 0.01),
-)  # fmt: skip
+    independent=1.17,
+    independent_power=0.52,
+    shared=2.97,
+    axes=(1.42, 0.91, 0.73, 0.8, 0.8, 1.05),
+    axes_power=(0.05, 0.0, -0.18, -0.22, -0.22, -0.04),
+    floor=(0.022, 0.022, 0.0175, 0.028, 0.028, 0.01),
+)
+
+
+#: Standard deviations of a survey's poses that the floors of the models above contain: position (m) and angle (degrees).
+FLOOR_SURVEY_M, FLOOR_SURVEY_DEG = 0.03, 0.05
+
+
+def survey_covariance(position_std_m: float | None, angle_std_deg: float | None) -> Float64[NDArray[np.float64], "6 6"]:
+    """Return the covariance that the errors of the survey's poses add to a pose in the map: translation (m), then rotation (rad).
+
+    A query is registered to the scans around it, and their common error moves its pose. The scans cannot show this error, because they
+    agree with each other. So the map states it. The floors of the models contain a survey with usual errors. Only the excess is added.
+
+    Args:
+        position_std_m: standard deviation of the survey's positions per axis, metres; None counts as usual.
+        angle_std_deg: standard deviation of the survey's angles, degrees; None counts as usual.
+    """
+    position = max((position_std_m or 0.0) ** 2 - FLOOR_SURVEY_M**2, 0.0)
+    angle = max((angle_std_deg or 0.0) ** 2 - FLOOR_SURVEY_DEG**2, 0.0) * np.deg2rad(1.0) ** 2
+    return np.diag([position] * 3 + [angle] * 3)
+
+
+#: Standard deviation of roll and pitch from the rectification of a stereo pair, degrees. Rows or a roll that are off by half a pixel tilt
+#: the disparity plane, and a pair cannot show it. Measured on stereo rigs of the calibration and on KITTI drive 0005 (decision 0151).
+RECTIFICATION_DEG = 0.2
+
+
+def rectification_covariance() -> Float64[NDArray[np.float64], "6 6"]:
+    """Return the covariance that the rectification of a stereo pair adds: translation (m), then rotation (rad).
+
+    Roll and pitch get the same variance, so it holds for every heading.
+    """
+    return np.diag(np.deg2rad([0, 0, 0, RECTIFICATION_DEG, RECTIFICATION_DEG, 0]) ** 2)
 
 
 def covariance_of(
-    information: Float64[NDArray[np.float64], "8 8"], scatter: Float64[NDArray[np.float64], "8 8"], noise: float, heading_rad: float,
+    information: Float64[NDArray[np.float64], "8 8"],
+    scatter: Float64[NDArray[np.float64], "8 8"],
+    noise: float,
+    heading_rad: float,
     model: CovarianceModel,
-) -> Float64[NDArray[np.float64], "6 6"]:  # fmt: skip
+) -> Float64[NDArray[np.float64], "6 6"]:
     """Compute the covariance of a pose: translation (m), then rotation (rad), in map axes about the camera's centre.
 
     The first part is a sandwich estimate (White, Econometrica 48, 1980): inverse information, scatter, inverse information.
@@ -112,8 +155,8 @@ def score_outer_product(
     state = np.zeros(1, STATE)
     state["R"], state["t"] = found.R_map_level, found.camera_m - cloud.origin_m
     state["log_scale"], state["offset"] = np.log(found.scale), found.offset
-    weighed = points.weighing_at_least(settings.fine_weight)
-    each = pulls(cloud.grid, cloud.surfels, weighed, state, settings.fine, patches(points.ray))
+    weighed = points.with_least_weight(settings.fine_weight)
+    each = gradients(cloud.grid, cloud.surfels, weighed, state, settings.fine, patches(points.ray))
     scatter: Float64[NDArray[np.float64], "8 8"] = each.T @ each * (len(each) / max(len(each) - UNKNOWNS, 1))
     return scatter
 
@@ -131,11 +174,11 @@ def disagreement(
     """
     sizes = np.sqrt(np.maximum(np.diag(information), 1e-300))
     strength, axes = np.linalg.eigh(information / np.outer(sizes, sizes))
-    told = strength > _TOLD
-    if not told.any():
+    observable = strength > _OBSERVABLE
+    if not observable.any():
         return 1.0
-    seen = np.einsum("ik,ij,jk->k", axes[:, told], scatter / np.outer(sizes, sizes), axes[:, told])
-    return max(float(np.mean(seen / strength[told])), _LEAST)
+    scattered = np.einsum("ik,ij,jk->k", axes[:, observable], scatter / np.outer(sizes, sizes), axes[:, observable])
+    return max(float(np.mean(scattered / strength[observable])), _LEAST)
 
 
 def patches(ray: Float32[NDArray[np.float32], "n 3"]) -> Int32[NDArray[np.int32], " n"]:

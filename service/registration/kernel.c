@@ -22,7 +22,7 @@ typedef struct {
     const int32_t *nearest;      /* (blocks, 512): index of the surfel nearest to the cell's centre, -1 for none */
 } Grid;
 
-/* Each array is padded with zeros to whole batches (AHEAD). */
+/* Each array is padded with zeros to whole batches (BATCH_SIZE). */
 typedef struct {
     int64_t count;
     const float *xyz[3]; /* level frame, m */
@@ -46,7 +46,7 @@ typedef struct {
     double R[9], t[3], log_scale, offset;
     double anchor[3], up[3]; /* mean of the priors of position and height (surfels' frame, m); normal of the ground there */
     double information[UNKNOWNS * UNKNOWNS];
-    double inliers, seen, weight;
+    double inliers, matched, weight;
     /* steps of the solver; 1 if its last step was small; half the weighted squared residuals before its last step */
     double iterations, converged, error;
 } State;
@@ -54,7 +54,8 @@ typedef struct {
 #define HEIGHT 60.0 /* m: how far surfaces may rise above or fall below the camera (streetfix_render) */
 #define SETTLED_M 1e-3 /* a pose has converged if its last step was smaller than this, m, */
 #define SETTLED_RAD 1.7e-3 /* and turned it by less than this, rad (0.1 degrees) */
-#define AHEAD 32 /* points per batch; their memory is prefetched together, or the kernel would mostly wait for memory (decision 0025) */
+/* Points per batch. Their memory is prefetched together. Otherwise the kernel would mostly wait for memory (decision 0025). */
+#define BATCH_SIZE 32
 #define LANES 8  /* partial sums side by side; the same number on every machine, so all machines give the same answer */
 
 /* Solves A x = b in place by Cholesky decomposition; returns 0 if A is not positive definite. */
@@ -79,7 +80,7 @@ static int solve(double A[UNKNOWNS][UNKNOWNS], double b[UNKNOWNS])
 }
 
 /* R <- exp(w) R by Rodrigues' formula. One step rotates by at most 0.1 rad. */
-static void turn_left(double R[9], const double w_in[3])
+static void rotate_left(double R[9], const double w_in[3])
 {
     double w[3] = {w_in[0], w_in[1], w_in[2]};
     double angle = sqrt(w[0] * w[0] + w[1] * w[1] + w[2] * w[2]);
@@ -105,19 +106,20 @@ static void turn_left(double R[9], const double w_in[3])
 
 /* A batch of points: their positions, surfels, gradients, residuals and weights. */
 typedef struct {
-    double y[3][AHEAD], at[3][AHEAD], stretch[AHEAD]; /* R y, and R y + t (surfels' frame, m); s / (1 + o q) */
-    const Surfel *found[AHEAD];                       /* 0 for none */
-    double gr[UNKNOWNS][AHEAD], r[AHEAD], w[AHEAD], known[AHEAD]; /* gradient of the residual, residual, weight; 1: surfel in reach */
+    double y[3][BATCH_SIZE], at[3][BATCH_SIZE], stretch[BATCH_SIZE]; /* R y, and R y + t (surfels' frame, m); s / (1 + o q) */
+    const Surfel *surfel[BATCH_SIZE]; /* 0 for none */
+    /* gradient of the residual, residual, weight; matched: 1 if a surfel is in reach, otherwise 0 */
+    double gradient[UNKNOWNS][BATCH_SIZE], r[BATCH_SIZE], w[BATCH_SIZE], matched[BATCH_SIZE];
 } Batch;
 
 /* Positions of the points first .. first + count - 1 in the surfels' frame, and their nearest surfels. */
-static inline void look_up(const Grid *g, const Surfel *surfels, const Query *q, const State *s, double e_scale, int64_t first,
-                           int64_t count, Batch *b)
+static inline void find_surfels(const Grid *g, const Surfel *surfels, const Query *q, const State *s, double e_scale, int64_t first,
+                                int64_t count, Batch *b)
 {
-    const int32_t *cells[AHEAD];
-    int32_t in[3][AHEAD];
-    for (int k = 0; k < AHEAD; k++) b->stretch[k] = e_scale / (1.0 + s->offset * q->q[first + k]);
-    for (int k = 0; k < AHEAD; k++) {
+    const int32_t *cells[BATCH_SIZE];
+    int32_t in[3][BATCH_SIZE];
+    for (int k = 0; k < BATCH_SIZE; k++) b->stretch[k] = e_scale / (1.0 + s->offset * q->q[first + k]);
+    for (int k = 0; k < BATCH_SIZE; k++) {
         const double px = b->stretch[k] * q->xyz[0][first + k], py = b->stretch[k] * q->xyz[1][first + k];
         const double pz = b->stretch[k] * q->xyz[2][first + k];
         for (int a = 0; a < 3; a++) {
@@ -129,7 +131,7 @@ static inline void look_up(const Grid *g, const Surfel *surfels, const Query *q,
      * become -2, which is no cell. */
     const double origin[3] = {g->ox, g->oy, g->oz}, scale = 1.0 / g->cell;
     for (int a = 0; a < 3; a++)
-        for (int k = 0; k < AHEAD; k++) {
+        for (int k = 0; k < BATCH_SIZE; k++) {
             double cell = (b->at[a][k] - origin[a]) * scale;
             cell = cell >= 0 ? cell : -2.0;
             cell = cell < 1e9 ? cell : -2.0;
@@ -146,10 +148,10 @@ static inline void look_up(const Grid *g, const Surfel *surfels, const Query *q,
         __builtin_prefetch(cells[k]);
     }
     for (int64_t k = 0; k < count; k++) {
-        b->found[k] = cells[k] && *cells[k] >= 0 ? surfels + *cells[k] : 0;
-        if (b->found[k]) __builtin_prefetch(b->found[k]);
+        b->surfel[k] = cells[k] && *cells[k] >= 0 ? surfels + *cells[k] : 0;
+        if (b->surfel[k]) __builtin_prefetch(b->surfel[k]);
     }
-    for (int64_t k = count; k < AHEAD; k++) b->found[k] = 0;
+    for (int64_t k = count; k < BATCH_SIZE; k++) b->surfel[k] = 0;
 }
 
 /* Adds the priors: position and height near the anchor, upright on the ground, log scale and disparity offset near 0. ``n`` is the summed
@@ -159,21 +161,21 @@ static void add_priors(const Options *o, const State *s, double n, double H[UNKN
     double p = o->prior_weight * n;
     double position = p / (o->position * o->position), height = p / (o->height * o->height);
     double tilt = p / (o->tilt * o->tilt), scale = p / (o->scale * o->scale), offset = p / (o->offset * o->offset);
-    double leans[3] = {s->R[2], s->R[5], s->R[8]}, away[3], above = 0;
+    double query_up[3] = {s->R[2], s->R[5], s->R[8]}, from_anchor[3], above_anchor = 0;
     /* To first order, this cross product is the rotation from the query's up axis to the ground's normal. */
-    double turn[3] = {leans[1] * s->up[2] - leans[2] * s->up[1], leans[2] * s->up[0] - leans[0] * s->up[2],
-                      leans[0] * s->up[1] - leans[1] * s->up[0]};
+    double tilt_error[3] = {query_up[1] * s->up[2] - query_up[2] * s->up[1], query_up[2] * s->up[0] - query_up[0] * s->up[2],
+                            query_up[0] * s->up[1] - query_up[1] * s->up[0]};
     for (int k = 0; k < 3; k++) {
-        away[k] = s->t[k] - s->anchor[k];
-        above += away[k] * s->up[k];
+        from_anchor[k] = s->t[k] - s->anchor[k];
+        above_anchor += from_anchor[k] * s->up[k];
     }
     for (int i = 0; i < 3; i++) {
         for (int j = 0; j < 3; j++) {
             H[i][j] += (height - position) * s->up[i] * s->up[j] + (i == j) * position;
             H[3 + i][3 + j] += tilt * ((i == j) - s->up[i] * s->up[j]) + (i == j) * 1e-3 * n;
         }
-        b[i] -= position * away[i] + (height - position) * above * s->up[i];
-        b[3 + i] += tilt * turn[i];
+        b[i] -= position * from_anchor[i] + (height - position) * above_anchor * s->up[i];
+        b[3 + i] += tilt * tilt_error[i];
     }
     H[6][6] += scale;
     b[6] -= scale * s->log_scale;
@@ -189,12 +191,12 @@ static void add_priors(const Options *o, const State *s, double n, double H[UNKN
 }
 
 /* Computes gradients, residuals and weights of a batch. The weight is 0 if no surfel is in reach. */
-static inline void tell(const Query *q, const Options *o, const State *s, double robust, double e_scale, int64_t first, Batch *b)
+static inline void linearise(const Query *q, const Options *o, const State *s, double robust, double e_scale, int64_t first, Batch *b)
 {
-    double n[3][AHEAD], off[3][AHEAD], thickness[AHEAD];
-    for (int k = 0; k < AHEAD; k++) {
-        const Surfel *m = b->found[k];
-        b->known[k] = m != 0;
+    double n[3][BATCH_SIZE], off[3][BATCH_SIZE], thickness[BATCH_SIZE];
+    for (int k = 0; k < BATCH_SIZE; k++) {
+        const Surfel *m = b->surfel[k];
+        b->matched[k] = m != 0;
         if (!m) {
             n[0][k] = n[1][k] = off[0][k] = off[1][k] = off[2][k] = 0;
             n[2][k] = thickness[k] = 1; /* avoids a variance of 0 */
@@ -207,21 +209,21 @@ static inline void tell(const Query *q, const Options *o, const State *s, double
     const float *rx = q->ray[0] + first, *ry = q->ray[1] + first, *rz = q->ray[2] + first;
     const float *sigma = q->sigma + first, *weight = q->weight + first, *depth = q->q + first;
     const double reach2 = o->reach * o->reach, surface2 = o->surface * o->surface, robust2 = robust * robust;
-    for (int k = 0; k < AHEAD; k++) {
+    for (int k = 0; k < BATCH_SIZE; k++) {
         const double dx = off[0][k], dy = off[1][k], dz = off[2][k], nx = n[0][k], ny = n[1][k], nz = n[2][k];
         const double y0 = b->y[0][k], y1 = b->y[1][k], y2 = b->y[2][k];
-        const double there = b->known[k], use = dx * dx + dy * dy + dz * dz > reach2 ? 0.0 : there;
+        const double there = b->matched[k], use = dx * dx + dy * dy + dz * dz > reach2 ? 0.0 : there;
         const double r = nx * dx + ny * dy + nz * dz;
         const double c = nx * (s->R[0] * (double)rx[k] + s->R[1] * (double)ry[k] + s->R[2] * (double)rz[k]) +
                          ny * (s->R[3] * (double)rx[k] + s->R[4] * (double)ry[k] + s->R[5] * (double)rz[k]) +
                          nz * (s->R[6] * (double)rx[k] + s->R[7] * (double)ry[k] + s->R[8] * (double)rz[k]);
         const double along_y = y0 * nx + y1 * ny + y2 * nz;
-        b->gr[0][k] = nx, b->gr[1][k] = ny, b->gr[2][k] = nz;
-        b->gr[3][k] = y1 * nz - y2 * ny;
-        b->gr[4][k] = y2 * nx - y0 * nz;
-        b->gr[5][k] = y0 * ny - y1 * nx;
-        b->gr[6][k] = along_y;
-        b->gr[7][k] = -along_y * depth[k] * b->stretch[k] / e_scale;
+        b->gradient[0][k] = nx, b->gradient[1][k] = ny, b->gradient[2][k] = nz;
+        b->gradient[3][k] = y1 * nz - y2 * ny;
+        b->gradient[4][k] = y2 * nx - y0 * nz;
+        b->gradient[5][k] = y0 * ny - y1 * nx;
+        b->gradient[6][k] = along_y;
+        b->gradient[7][k] = -along_y * depth[k] * b->stretch[k] / e_scale;
         /* The error of a triangulating camera is uniform in 1 / range. So the variance is taken at the range where the ray intersects the
          * surface. At the measured range, points measured too near would count as well measured and bias the pose (decision 0036). */
         double ratio = 1 - r / (along_y != 0 ? along_y : 1);
@@ -236,14 +238,14 @@ static inline void tell(const Query *q, const Options *o, const State *s, double
         const double k2 = 4 * even + robust2, damp = k2 / (k2 + r * r);
         b->r[k] = r;
         b->w[k] = use * weight[k] * damp * damp / variance;
-        b->known[k] = use;
+        b->matched[k] = use;
     }
 }
 
 static inline void add_products(const double *one, const double *other, double *sums)
 {
     double own[LANES] = {0};
-    for (int k = 0; k < AHEAD; k += LANES)
+    for (int k = 0; k < BATCH_SIZE; k += LANES)
         for (int l = 0; l < LANES; l++) own[l] += one[k + l] * other[k + l];
     for (int l = 0; l < LANES; l++) sums[l] += own[l];
 }
@@ -251,24 +253,24 @@ static inline void add_products(const double *one, const double *other, double *
 static inline void align_one(const Grid *g, const Surfel *surfels, const Query *q, const Options *o, State *s)
 {
     Batch batch;
-    double known = 0;
-    for (int64_t i = 0; i < q->count; i++) known += q->weight[i];
+    double total_weight = 0;
+    for (int64_t i = 0; i < q->count; i++) total_weight += q->weight[i];
     s->iterations = s->converged = 0;
     for (int64_t it = 0; it < o->iterations; it++) {
         double share = o->iterations > 1 ? (double)it / (double)(o->iterations - 1) : 1.0;
         double robust = o->robust_first * pow(o->robust_last / o->robust_first, share);
         double sums[UNKNOWNS][UNKNOWNS + 1][LANES] = {{{0}}}, e_scale = exp(s->log_scale), total = 0, squares = 0;
-        for (int64_t first = 0; first < q->count; first += AHEAD) {
-            const int64_t left = q->count - first, count = left < AHEAD ? left : AHEAD;
-            look_up(g, surfels, q, s, e_scale, first, count, &batch);
-            tell(q, o, s, robust, e_scale, first, &batch);
+        for (int64_t first = 0; first < q->count; first += BATCH_SIZE) {
+            const int64_t left = q->count - first, count = left < BATCH_SIZE ? left : BATCH_SIZE;
+            find_surfels(g, surfels, q, s, e_scale, first, count, &batch);
+            linearise(q, o, s, robust, e_scale, first, &batch);
             for (int a = 0; a < UNKNOWNS; a++) {
-                double weighted[AHEAD];
-                for (int k = 0; k < AHEAD; k++) weighted[k] = batch.w[k] * batch.gr[a][k];
-                for (int d = 0; d <= a; d++) add_products(weighted, batch.gr[d], sums[a][d]);
+                double weighted[BATCH_SIZE];
+                for (int k = 0; k < BATCH_SIZE; k++) weighted[k] = batch.w[k] * batch.gradient[a][k];
+                for (int d = 0; d <= a; d++) add_products(weighted, batch.gradient[d], sums[a][d]);
                 add_products(weighted, batch.r, sums[a][UNKNOWNS]);
             }
-            for (int64_t k = 0; k < count; k++) total += batch.known[k] * q->weight[first + k];
+            for (int64_t k = 0; k < count; k++) total += batch.matched[k] * q->weight[first + k];
             for (int64_t k = 0; k < count; k++) squares += batch.w[k] * batch.r[k] * batch.r[k];
         }
         double H[UNKNOWNS][UNKNOWNS], b[UNKNOWNS];
@@ -282,12 +284,12 @@ static inline void align_one(const Grid *g, const Surfel *surfels, const Query *
             for (int l = 0; l < LANES; l++) b[a] -= sums[a][UNKNOWNS][l];
         }
         for (int a = 0; a < UNKNOWNS; a++) memcpy(s->information + a * UNKNOWNS, H[a], sizeof H[a]);
-        s->seen = total;
+        s->matched = total;
         s->error = 0.5 * squares;
-        add_priors(o, s, known, H, b);
+        add_priors(o, s, total_weight, H, b);
         if (!solve(H, b)) return;
         for (int k = 0; k < 3; k++) s->t[k] += b[k];
-        turn_left(s->R, b + 3);
+        rotate_left(s->R, b + 3);
         s->log_scale += b[6];
         s->offset += b[7];
         s->iterations = (double)(it + 1);
@@ -303,16 +305,16 @@ static inline void score_one(const Grid *g, const Surfel *surfels, const Query *
 {
     Batch batch;
     double inliers = 0, total = 0, e_scale = exp(s->log_scale);
-    for (int64_t first = 0; first < q->count; first += AHEAD) {
-        const int64_t left = q->count - first, count = left < AHEAD ? left : AHEAD;
-        look_up(g, surfels, q, s, e_scale, first, count, &batch);
+    for (int64_t first = 0; first < q->count; first += BATCH_SIZE) {
+        const int64_t left = q->count - first, count = left < BATCH_SIZE ? left : BATCH_SIZE;
+        find_surfels(g, surfels, q, s, e_scale, first, count, &batch);
         for (int64_t k = 0; k < count; k++) {
             const int64_t i = first + k;
             double sigma = q->sigma[i];
             if (batch.y[2][k] < height_min) continue;
             double w = q->weight[i] / (1 + 4 * sigma * sigma);
             total += w;
-            const Surfel *m = batch.found[k];
+            const Surfel *m = batch.surfel[k];
             if (!m) continue;
             double dx = batch.at[0][k] - m->xyz[0], dy = batch.at[1][k] - m->xyz[1], dz = batch.at[2][k] - m->xyz[2];
             if (dx * dx + dy * dy + dz * dz > 1.0 + 4 * sigma * sigma) continue;
@@ -336,23 +338,23 @@ WIDE void streetfix_align(const Grid *g, const Surfel *surfels, const Query *q, 
     }
 }
 
-/* Adds weight x residual x gradient of all points of each patch to ``pulls`` (patches, 8), which the caller sets to 0. */
-void streetfix_pulls(const Grid *g, const Surfel *surfels, const Query *q, const Options *o, const State *s, const int32_t *patch,
-                     double *pulls)
+/* Adds weight x residual x gradient of all points of each patch to ``gradients`` (patches, 8), which the caller sets to 0. */
+void streetfix_gradients(const Grid *g, const Surfel *surfels, const Query *q, const Options *o, const State *s, const int32_t *patch,
+                         double *gradients)
 {
     Batch batch;
     const double e_scale = exp(s->log_scale);
-    for (int64_t first = 0; first < q->count; first += AHEAD) {
-        const int64_t left = q->count - first, count = left < AHEAD ? left : AHEAD;
-        look_up(g, surfels, q, s, e_scale, first, count, &batch);
-        tell(q, o, s, o->robust_last, e_scale, first, &batch);
+    for (int64_t first = 0; first < q->count; first += BATCH_SIZE) {
+        const int64_t left = q->count - first, count = left < BATCH_SIZE ? left : BATCH_SIZE;
+        find_surfels(g, surfels, q, s, e_scale, first, count, &batch);
+        linearise(q, o, s, o->robust_last, e_scale, first, &batch);
         for (int64_t k = 0; k < count; k++)
-            for (int a = 0; a < UNKNOWNS; a++) pulls[UNKNOWNS * patch[first + k] + a] += batch.w[k] * batch.r[k] * batch.gr[a][k];
+            for (int a = 0; a < UNKNOWNS; a++) gradients[UNKNOWNS * patch[first + k] + a] += batch.w[k] * batch.r[k] * batch.gradient[a][k];
     }
 }
 
 /* Sets ``mark`` (bx, by, bz) to 1 for all blocks that the cube of +-``reach`` around a surfel touches. */
-void streetfix_mark(const Grid *g, const Surfel *surfels, int64_t count, double reach, uint8_t *mark)
+void streetfix_mark_blocks(const Grid *g, const Surfel *surfels, int64_t count, double reach, uint8_t *mark)
 {
     double edge = g->cell * BLOCK;
     for (int64_t i = 0; i < count; i++) {
@@ -371,7 +373,7 @@ void streetfix_mark(const Grid *g, const Surfel *surfels, int64_t count, double 
 
 /* Writes to ``nearest`` the index of the surfel nearest to each cell's centre within reach, and to ``distance2`` its squared distance. The
  * caller sets ``nearest`` to -1 and ``distance2`` to a large value. */
-void streetfix_fill(const Grid *g, const Surfel *surfels, int64_t count, double reach, int32_t *nearest, float *distance2)
+void streetfix_fill_grid(const Grid *g, const Surfel *surfels, int64_t count, double reach, int32_t *nearest, float *distance2)
 {
     const double o[3] = {g->ox, g->oy, g->oz};
     for (int64_t i = 0; i < count; i++) {
@@ -444,48 +446,50 @@ void streetfix_render(const Surfel *surfels, const double *tiles, int64_t tile_c
 }
 
 typedef struct {
-    double hit, new, gone, any;  /* weights of the beam model's components */
-    double rough_m, span_m;      /* roughness of surfaces; length over which gone and any are uniform */
-    double certain, margin_m;    /* a point is off the surface beyond certain x sigma + margin_m */
-    double nothing_m;            /* depth assumed for an empty pixel */
-    double scale, offset;        /* registered with the pose */
+    double hit, new, removed, outlier; /* weights of the beam model's components */
+    double roughness_m, span_m;        /* roughness of surfaces; length over which removed and outlier are uniform */
+    double threshold_sigmas, margin_m; /* a point is off the surface beyond threshold_sigmas x sigma + margin_m */
+    double unmapped_m;                 /* depth assumed for an empty pixel */
+    double scale, offset;              /* registered with the pose */
 } Beam;
 
 /* Compares measured depths with a rendered depth image. at: index of each point's pixel; z, sigma: depth along the optical axis and its
- * standard deviation; q: as in Query. found: sum of the logarithms of the density, then the numbers of points behind the map's surfaces,
+ * standard deviation; q: as in Query. out: sum of the logarithms of the density, then the numbers of points behind the map's surfaces,
  * in front of them, and where nothing is mapped. Surfaces are those of the 3 x 3 pixels around a point's own. */
-void streetfix_agree(const float *drawn, int64_t height, int64_t width, int64_t count, const int32_t *at, const double *z,
-                     const double *sigma, const float *q, const Beam *o, double *found)
+void streetfix_consistency(const float *rendered, int64_t height, int64_t width, int64_t count, const int32_t *at, const double *z,
+                           const double *sigma, const float *q, const Beam *o, double *out)
 {
     double likelihood = 0, through = 0, front = 0, unmapped = 0;
     for (int64_t i = 0; i < count; i++) {
         const int64_t row = at[i] / width, column = at[i] % width;
         const int64_t top = row > 0 ? row - 1 : 0, bottom = row + 1 < height ? row + 1 : row;
         const int64_t left = column > 0 ? column - 1 : 0, right = column + 1 < width ? column + 1 : column;
-        float low = INFINITY, high = 0;
+        float nearest = INFINITY, farthest = 0;
         for (int64_t v = top; v <= bottom; v++)
             for (int64_t u = left; u <= right; u++) {
-                const float d = drawn[v * width + u] > 0 ? drawn[v * width + u] : (float)o->nothing_m;
-                low = d < low ? d : low;
-                high = d > high ? d : high;
+                const float d = rendered[v * width + u] > 0 ? rendered[v * width + u] : (float)o->unmapped_m;
+                nearest = d < nearest ? d : nearest;
+                farthest = d > farthest ? d : farthest;
             }
-        const double mapped = drawn[at[i]] > 0 ? (double)drawn[at[i]] : o->nothing_m;
-        const double seen = z[i] * o->scale / (1.0 + o->offset * q[i]), spread = sqrt(sigma[i] * sigma[i] + o->rough_m * o->rough_m);
-        const double off = (seen - mapped) / spread, hit = exp(-0.5 * off * off) / (2.5066282746310002 * spread);
-        const double fresh = seen < mapped ? o->new / (mapped > 2.0 ? mapped : 2.0) : 0.0;
-        likelihood += log(o->hit * hit + fresh + ((seen > mapped ? o->gone : 0.0) + o->any) / o->span_m);
-        const double beyond = o->certain * sigma[i] + o->margin_m;
-        if (low >= (float)o->nothing_m)
+        const double mapped = rendered[at[i]] > 0 ? (double)rendered[at[i]] : o->unmapped_m;
+        const double corrected = z[i] * o->scale / (1.0 + o->offset * q[i]),
+                     sigma_total = sqrt(sigma[i] * sigma[i] + o->roughness_m * o->roughness_m);
+        const double deviation = (corrected - mapped) / sigma_total,
+                     hit = exp(-0.5 * deviation * deviation) / (2.5066282746310002 * sigma_total);
+        const double new_object = corrected < mapped ? o->new / (mapped > 2.0 ? mapped : 2.0) : 0.0;
+        likelihood += log(o->hit * hit + new_object + ((corrected > mapped ? o->removed : 0.0) + o->outlier) / o->span_m);
+        const double threshold = o->threshold_sigmas * sigma[i] + o->margin_m;
+        if (nearest >= (float)o->unmapped_m)
             unmapped++;
-        else if (seen > (double)high + beyond)
+        else if (corrected > (double)farthest + threshold)
             through++;
-        else if (seen < (double)low - beyond)
+        else if (corrected < (double)nearest - threshold)
             front++;
     }
-    found[0] = likelihood;
-    found[1] = through;
-    found[2] = front;
-    found[3] = unmapped;
+    out[0] = likelihood;
+    out[1] = through;
+    out[2] = front;
+    out[3] = unmapped;
 }
 
 /* service/compiled.py compares this table with Python's structures when it loads the library. */
@@ -504,12 +508,12 @@ const LayoutEntry streetfix_layout[] = {
     LAYOUT_FIELD(Options, free_scale), LAYOUT_FIELD(Options, free_offset),
     LAYOUT_STRUCT(State), LAYOUT_FIELD(State, R), LAYOUT_FIELD(State, t), LAYOUT_FIELD(State, log_scale),
     LAYOUT_FIELD(State, offset), LAYOUT_FIELD(State, anchor), LAYOUT_FIELD(State, up),
-    LAYOUT_FIELD(State, information), LAYOUT_FIELD(State, inliers), LAYOUT_FIELD(State, seen),
+    LAYOUT_FIELD(State, information), LAYOUT_FIELD(State, inliers), LAYOUT_FIELD(State, matched),
     LAYOUT_FIELD(State, weight), LAYOUT_FIELD(State, iterations), LAYOUT_FIELD(State, converged), LAYOUT_FIELD(State, error),
-    LAYOUT_STRUCT(Beam), LAYOUT_FIELD(Beam, hit), LAYOUT_FIELD(Beam, new), LAYOUT_FIELD(Beam, gone),
-    LAYOUT_FIELD(Beam, any), LAYOUT_FIELD(Beam, rough_m), LAYOUT_FIELD(Beam, span_m), LAYOUT_FIELD(Beam, certain),
-    LAYOUT_FIELD(Beam, margin_m), LAYOUT_FIELD(Beam, nothing_m), LAYOUT_FIELD(Beam, scale), LAYOUT_FIELD(Beam, offset),
-    LAYOUT_CONSTANT(UNKNOWNS), LAYOUT_CONSTANT(BLOCK), LAYOUT_CONSTANT(AHEAD),
+    LAYOUT_STRUCT(Beam), LAYOUT_FIELD(Beam, hit), LAYOUT_FIELD(Beam, new), LAYOUT_FIELD(Beam, removed),
+    LAYOUT_FIELD(Beam, outlier), LAYOUT_FIELD(Beam, roughness_m), LAYOUT_FIELD(Beam, span_m), LAYOUT_FIELD(Beam, threshold_sigmas),
+    LAYOUT_FIELD(Beam, margin_m), LAYOUT_FIELD(Beam, unmapped_m), LAYOUT_FIELD(Beam, scale), LAYOUT_FIELD(Beam, offset),
+    LAYOUT_CONSTANT(UNKNOWNS), LAYOUT_CONSTANT(BLOCK), LAYOUT_CONSTANT(BATCH_SIZE),
     LAYOUT_END,
 };
 /* clang-format on */

@@ -24,7 +24,7 @@ UNKNOWNS = 8
 #: Cells along the edge of a grid block.
 BLOCK = 8
 #: Points in a batch of the kernel. Arrays of points are padded to whole batches.
-AHEAD = 32
+BATCH_SIZE = 32
 LIBRARY = Path(__file__).with_name("_kernel.so")
 
 #: A surfel: position (m, surfels' frame), unit normal, thickness across the surface (m), number of survey points.
@@ -34,19 +34,27 @@ SURFEL = np.dtype([("xyz", "<f4", (3,)), ("normal", "<f4", (3,)), ("thickness_m"
 STATE = np.dtype(
     [("R", "<f8", (3, 3)), ("t", "<f8", (3,)), ("log_scale", "<f8"), ("offset", "<f8"), ("anchor", "<f8", (3,)), ("up", "<f8", (3,)),
      ("information", "<f8", (UNKNOWNS, UNKNOWNS)),
-     ("inliers", "<f8"), ("seen", "<f8"), ("weight", "<f8"),
+     ("inliers", "<f8"), ("matched", "<f8"), ("weight", "<f8"),
      ("iterations", "<f8"), ("converged", "<f8"), ("error", "<f8")]
 )  # fmt: skip
 
 
 class _Grid(Structure):
-    _fields_ = [*((name, c_double) for name in ("ox", "oy", "oz", "cell")), *((name, c_int64) for name in ("bx", "by", "bz")),
-                ("block", c_void_p), ("nearest", c_void_p)]  # fmt: skip
+    _fields_ = [
+        *((name, c_double) for name in ("ox", "oy", "oz", "cell")),
+        *((name, c_int64) for name in ("bx", "by", "bz")),
+        ("block", c_void_p),
+        ("nearest", c_void_p),
+    ]
 
 
 class _Query(Structure):
-    _fields_ = [("count", c_int64), ("xyz", c_void_p * 3), ("ray", c_void_p * 3),
-                *((name, c_void_p) for name in ("sigma", "weight", "q"))]  # fmt: skip
+    _fields_ = [
+        ("count", c_int64),
+        ("xyz", c_void_p * 3),
+        ("ray", c_void_p * 3),
+        *((name, c_void_p) for name in ("sigma", "weight", "q")),
+    ]
 
 
 class _Options(Structure):
@@ -64,24 +72,24 @@ class BeamModel:
     Attributes:
         hit: weight of rays that end on the mapped surface (normal distribution).
         new: weight of rays that end before it, on a new object (uniform from the camera to the surface).
-        gone: weight of rays that end behind it, because an object is gone (uniform over ``span_m``).
-        any: weight of outliers at any depth (uniform over ``span_m``).
-        rough_m: standard deviation of the surfaces' roughness, m.
-        span_m: length over which ``gone`` and ``any`` are uniform, m.
-        certain: a point is off the surface beyond ``certain`` x its standard deviation + ``margin_m``.
+        removed: weight of rays that end behind it, because an object is gone (uniform over ``span_m``).
+        outlier: weight of outliers at any depth (uniform over ``span_m``).
+        roughness_m: standard deviation of the surfaces' roughness, m.
+        span_m: length over which ``removed`` and ``outlier`` are uniform, m.
+        threshold_sigmas: a point is off the surface beyond ``threshold_sigmas`` x its standard deviation + ``margin_m``.
         margin_m: constant part of that threshold, m.
-        nothing_m: depth assumed for pixels where the map shows no surface, m.
+        unmapped_m: depth assumed for pixels where the map shows no surface, m.
     """
 
     hit: float
     new: float
-    gone: float
-    any: float
-    rough_m: float
+    removed: float
+    outlier: float
+    roughness_m: float
     span_m: float
-    certain: float
+    threshold_sigmas: float
     margin_m: float
-    nothing_m: float
+    unmapped_m: float
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -128,24 +136,43 @@ def _library() -> ctypes.CDLL:
     library = load(
         LIBRARY,
         {"Surfel": SURFEL, "Grid": _Grid, "Query": _Query, "Options": _Options, "State": STATE, "Beam": _Beam},
-        {"UNKNOWNS": UNKNOWNS, "BLOCK": BLOCK, "AHEAD": AHEAD},
+        {"UNKNOWNS": UNKNOWNS, "BLOCK": BLOCK, "BATCH_SIZE": BATCH_SIZE},
     )
     library.streetfix_align.argtypes = [
-        POINTER(_Grid), c_void_p, POINTER(_Query), POINTER(_Options), c_double, c_double, c_int64, c_void_p,
-    ]  # fmt: skip
-    library.streetfix_pulls.argtypes = [
-        POINTER(_Grid), c_void_p, POINTER(_Query), POINTER(_Options), c_void_p, c_void_p, c_void_p,
-    ]  # fmt: skip
-    library.streetfix_agree.argtypes = [
+        POINTER(_Grid),
+        c_void_p,
+        POINTER(_Query),
+        POINTER(_Options),
+        c_double,
+        c_double,
+        c_int64,
+        c_void_p,
+    ]
+    library.streetfix_gradients.argtypes = [
+        POINTER(_Grid),
+        c_void_p,
+        POINTER(_Query),
+        POINTER(_Options),
+        c_void_p,
+        c_void_p,
+        c_void_p,
+    ]
+    library.streetfix_consistency.argtypes = [
         c_void_p, c_int64, c_int64, c_int64, c_void_p, c_void_p, c_void_p, c_void_p, POINTER(_Beam), c_void_p,
     ]  # fmt: skip
-    library.streetfix_mark.argtypes = [POINTER(_Grid), c_void_p, c_int64, c_double, c_void_p]
-    library.streetfix_fill.argtypes = [POINTER(_Grid), c_void_p, c_int64, c_double, c_void_p, c_void_p]
+    library.streetfix_mark_blocks.argtypes = [POINTER(_Grid), c_void_p, c_int64, c_double, c_void_p]
+    library.streetfix_fill_grid.argtypes = [POINTER(_Grid), c_void_p, c_int64, c_double, c_void_p, c_void_p]
     library.streetfix_render.argtypes = [
         c_void_p, c_void_p, c_int64, c_double, c_void_p, c_void_p, c_double, c_double, c_double, c_double, c_int64, c_int64,
         c_double, c_double, c_void_p,
     ]  # fmt: skip
-    for name in ("streetfix_align", "streetfix_pulls", "streetfix_mark", "streetfix_fill", "streetfix_render"):
+    for name in (
+        "streetfix_align",
+        "streetfix_gradients",
+        "streetfix_mark_blocks",
+        "streetfix_fill_grid",
+        "streetfix_render",
+    ):
         getattr(library, name).restype = None
     return library
 
@@ -191,7 +218,7 @@ class QueryPoints:
     def __len__(self) -> int:
         return len(self.sigma)
 
-    def weighing_at_least(self, weight: float) -> "QueryPoints":
+    def with_least_weight(self, weight: float) -> "QueryPoints":
         """Raise smaller weights to a lower limit; all else stays.
 
         Args:
@@ -217,9 +244,15 @@ class QueryPoints:
 
 
 def align(
-    grid: NearestGrid, surfels: NDArray[Any], query: QueryPoints, states: NDArray[Any], options: SolverOptions, *,
-    tolerance_m: float = 0.1, height_min_m: float = -1e9,
-) -> None:  # fmt: skip
+    grid: NearestGrid,
+    surfels: NDArray[Any],
+    query: QueryPoints,
+    states: NDArray[Any],
+    options: SolverOptions,
+    *,
+    tolerance_m: float = 0.1,
+    height_min_m: float = -1e9,
+) -> None:
     """Register every start on the map in place, then score it.
 
     The solver minimises weighted, robust point-to-plane distances (Gauss-Newton, Geman-McClure kernel).
@@ -235,14 +268,25 @@ def align(
     """
     points, given = _as_c(query, options)
     _library().streetfix_align(
-        byref(grid._as_c()), surfels.ctypes.data, byref(points), byref(given), tolerance_m, height_min_m, len(states), states.ctypes.data
-    )  # fmt: skip
+        byref(grid._as_c()),
+        surfels.ctypes.data,
+        byref(points),
+        byref(given),
+        tolerance_m,
+        height_min_m,
+        len(states),
+        states.ctypes.data,
+    )
 
 
-def pulls(
-    grid: NearestGrid, surfels: NDArray[Any], query: QueryPoints, state: NDArray[Any], options: SolverOptions,
+def gradients(
+    grid: NearestGrid,
+    surfels: NDArray[Any],
+    query: QueryPoints,
+    state: NDArray[Any],
+    options: SolverOptions,
     patch: Int32[NDArray[np.int32], " n"],
-) -> Float64[NDArray[np.float64], "B 8"]:  # fmt: skip
+) -> Float64[NDArray[np.float64], "B 8"]:
     """Sum the gradients of each patch's points at a pose: weight x residual x derivative by the eight unknowns.
 
     Args:
@@ -255,15 +299,21 @@ def pulls(
     """
     found = np.zeros((int(patch.max(initial=-1)) + 1, UNKNOWNS))
     points, given = _as_c(query, options)
-    _library().streetfix_pulls(
-        byref(grid._as_c()), surfels.ctypes.data, byref(points), byref(given), state.ctypes.data, patch.ctypes.data, found.ctypes.data
-    )  # fmt: skip
+    _library().streetfix_gradients(
+        byref(grid._as_c()),
+        surfels.ctypes.data,
+        byref(points),
+        byref(given),
+        state.ctypes.data,
+        patch.ctypes.data,
+        found.ctypes.data,
+    )
     return found
 
 
 def _as_c(query: QueryPoints, options: SolverOptions) -> tuple[_Query, _Options]:
     given = _Options(**{field[0]: getattr(options, field[0]) for field in _Options._fields_})
-    planes = np.zeros((9, -(-len(query) // AHEAD) * AHEAD), np.float32)
+    planes = np.zeros((9, -(-len(query) // BATCH_SIZE) * BATCH_SIZE), np.float32)
     for rows, values in (
         (slice(0, 3), query.xyz.T),
         (slice(3, 6), query.ray.T),
@@ -291,21 +341,27 @@ def nearest_grid(surfels: NDArray[Any], *, cell_m: float, reach_m: float) -> Nea
     shape = np.ceil((high + reach_m + 2 * cell_m - origin) / (BLOCK * cell_m)).astype(int) + 1
     mark = np.zeros(tuple(shape), np.uint8)
     empty = NearestGrid(origin, cell_m, np.zeros(tuple(shape), np.int32), np.zeros((0, BLOCK**3), np.int32))
-    _library().streetfix_mark(byref(empty._as_c()), surfels.ctypes.data, len(surfels), reach_m, mark.ctypes.data)
+    _library().streetfix_mark_blocks(byref(empty._as_c()), surfels.ctypes.data, len(surfels), reach_m, mark.ctypes.data)
     block = np.where(mark > 0, np.cumsum(mark).reshape(mark.shape) - 1, -1).astype(np.int32)
     nearest = np.full((int(mark.sum()), BLOCK**3), -1, np.int32)
     distance2 = np.full(nearest.shape, np.inf, np.float32)
     grid = NearestGrid(origin, cell_m, block, nearest)
-    _library().streetfix_fill(
+    _library().streetfix_fill_grid(
         byref(grid._as_c()), surfels.ctypes.data, len(surfels), reach_m, nearest.ctypes.data, distance2.ctypes.data
     )
     return grid
 
 
 def render(
-    surfels: NDArray[Any], tiles: Float64[NDArray[np.float64], "n 4"], *, tile_m: float, T_map_camera: Float64[NDArray[np.float64], "4 4"],
-    camera: PinholeCamera, size_m: float, reach_m: float,
-) -> Float32[NDArray[np.float32], "H W"]:  # fmt: skip
+    surfels: NDArray[Any],
+    tiles: Float64[NDArray[np.float64], "n 4"],
+    *,
+    tile_m: float,
+    T_map_camera: Float64[NDArray[np.float64], "4 4"],
+    camera: PinholeCamera,
+    size_m: float,
+    reach_m: float,
+) -> Float32[NDArray[np.float32], "H W"]:
     """Render the depth image that a camera would see of the surfels: z in metres, 0 where nothing is mapped.
 
     Args:
@@ -320,21 +376,41 @@ def render(
     depth = np.empty((camera.height, camera.width), np.float32)
     R, t = np.ascontiguousarray(T_map_camera[:3, :3]), np.ascontiguousarray(T_map_camera[:3, 3])
     _library().streetfix_render(
-        surfels.ctypes.data, tiles.ctypes.data, len(tiles), reach_m + 0.71 * tile_m, R.ctypes.data, t.ctypes.data, camera.fx,
-        camera.fy, camera.cx, camera.cy, camera.width, camera.height, size_m / 2, reach_m, depth.ctypes.data,
-    )  # fmt: skip
+        surfels.ctypes.data,
+        tiles.ctypes.data,
+        len(tiles),
+        reach_m + 0.71 * tile_m,
+        R.ctypes.data,
+        t.ctypes.data,
+        camera.fx,
+        camera.fy,
+        camera.cx,
+        camera.cy,
+        camera.width,
+        camera.height,
+        size_m / 2,
+        reach_m,
+        depth.ctypes.data,
+    )
     depth[depth > 1e8] = 0
     return depth
 
 
-def agree(
-    drawn: Float32[NDArray[np.float32], "H W"], pixel: Int32[NDArray[np.int32], " n"], z: Float64[NDArray[np.float64], " n"],
-    sigma: Float64[NDArray[np.float64], " n"], q: Float32[NDArray[np.float32], " n"], model: BeamModel, *, scale: float, offset: float,
-) -> tuple[float, float, float, float]:  # fmt: skip
+def consistency(
+    rendered: Float32[NDArray[np.float32], "H W"],
+    pixel: Int32[NDArray[np.int32], " n"],
+    z: Float64[NDArray[np.float64], " n"],
+    sigma: Float64[NDArray[np.float64], " n"],
+    q: Float32[NDArray[np.float32], " n"],
+    model: BeamModel,
+    *,
+    scale: float,
+    offset: float,
+) -> tuple[float, float, float, float]:
     """Compare measured depths with a depth image of the map (``render``).
 
     Args:
-        drawn: rendered depth, m; 0 where nothing is mapped.
+        rendered: rendered depth, m; 0 where nothing is mapped.
         pixel: index of each point's pixel, counted row by row.
         z: measured depth of each point along the optical axis, m.
         sigma: standard deviation of ``z``, m.
@@ -354,18 +430,29 @@ def agree(
     if (
         not count
         or any(len(each) != count for each in (z, sigma, q))
-        or not 0 <= pixel.min() <= pixel.max() < drawn.size
+        or not 0 <= pixel.min() <= pixel.max() < rendered.size
     ):
         raise ValueError(
-            f"{count} points: expected at least one, arrays of equal length, and pixels inside the image {drawn.shape}"
+            f"{count} points: expected at least one, arrays of equal length, and pixels inside the image {rendered.shape}"
         )
-    arrays = [np.ascontiguousarray(*given) for given in (
-        (drawn, np.float32), (pixel, np.int32), (z, np.float64), (sigma, np.float64), (q, np.float32),
-    )]  # fmt: skip
+    arrays = [
+        np.ascontiguousarray(*given)
+        for given in (
+            (rendered, np.float32),
+            (pixel, np.int32),
+            (z, np.float64),
+            (sigma, np.float64),
+            (q, np.float32),
+        )
+    ]
     found = np.zeros(4)
-    _library().streetfix_agree(
-        arrays[0].ctypes.data, *drawn.shape, count, *(each.ctypes.data for each in arrays[1:]),
-        byref(_Beam(*astuple(model), scale, offset)), found.ctypes.data,
-    )  # fmt: skip
+    _library().streetfix_consistency(
+        arrays[0].ctypes.data,
+        *rendered.shape,
+        count,
+        *(each.ctypes.data for each in arrays[1:]),
+        byref(_Beam(*astuple(model), scale, offset)),
+        found.ctypes.data,
+    )
     likelihood, through, front, unmapped = (found / count).tolist()
     return likelihood, through, front, unmapped

@@ -27,18 +27,25 @@ class LocalSearchSettings:
             local minima. On KITTI the search would move right poses away (decision 0129).
         offsets: of the starts from the pose: along its heading (m), across it (m), rotation about the vertical axis (rad).
         points: largest number of points in the search.
-        kept: largest number of poses to return besides the given one.
+        most_poses: largest number of poses to return besides the given one.
         apart_m: least distance between any two returned poses, m. Rotation is converted to metres by ``arm_m``.
         arm_m: lever arm of a rotation, m.
     """
 
     from_noise: float = 1.2e-3
     offsets: tuple[tuple[float, float, float], ...] = (
-        (0.0, 0.0, 0.0), (1.4, 0.0, 0.0), (-1.4, 0.0, 0.0), (0.0, 0.8, 0.0), (0.0, -0.8, 0.0),
-        (0.0, 0.8, 0.09), (0.0, -0.8, -0.09), (0.0, 0.8, -0.09), (0.0, -0.8, 0.09),
-    )  # fmt: skip
+        (0.0, 0.0, 0.0),
+        (1.4, 0.0, 0.0),
+        (-1.4, 0.0, 0.0),
+        (0.0, 0.8, 0.0),
+        (0.0, -0.8, 0.0),
+        (0.0, 0.8, 0.09),
+        (0.0, -0.8, -0.09),
+        (0.0, 0.8, -0.09),
+        (0.0, -0.8, 0.09),
+    )
     points: int = 1500
-    kept: int = 3
+    most_poses: int = 3
     apart_m: float = 0.25
     arm_m: float = 3.0
 
@@ -49,16 +56,21 @@ class LocalPose:
 
     Attributes:
         pose: registered, map frame.
-        still: share of inliers among the static points, from 0 to 1.
+        static_inliers: share of inliers among the static points, from 0 to 1.
     """
 
     pose: Registered
-    still: float
+    static_inliers: float
 
 
 def search_locally(
-    cloud: SurfelMap, points: QueryPoints, found: Registered, height_m: float, settings: RegistrationSettings, around: LocalSearchSettings
-) -> list[LocalPose]:  # fmt: skip
+    cloud: SurfelMap,
+    points: QueryPoints,
+    found: Registered,
+    height_m: float,
+    settings: RegistrationSettings,
+    around: LocalSearchSettings,
+) -> list[LocalPose]:
     """Return the given pose and the best other poses around it.
 
     Args:
@@ -70,7 +82,7 @@ def search_locally(
         around: settings of the local search.
 
     Returns:
-        The given pose first, then at most ``around.kept`` others, those with the largest share of static inliers first.
+        The given pose first, then at most ``around.most_poses`` others, those with the largest share of static inliers first.
     """
     states = np.zeros(1 + len(around.offsets), STATE)
     states["R"], states["t"] = found.R_map_level, found.camera_m - cloud.origin_m
@@ -81,24 +93,26 @@ def search_locally(
     states["anchor"], states["up"] = states["t"], found.R_map_level[:, 2]
     align(cloud.grid, cloud.surfels, points.thinned(around.points), states[1:], settings.fine)
     score(cloud, points, states, height_m, settings)
-    alone = states.copy()
-    score(cloud, points.subset(np.flatnonzero(points.weight == points.weight.max())), alone, height_m, settings)
-    still: Float64[NDArray[np.float64], " n"] = alone["inliers"]
-    kept = _distinct(states, still, around)
-    near = [LocalPose(registered_of(states[k], found.hypothesis, cloud.origin_m), float(still[k])) for k in kept]
-    return [replace(near[0], pose=found), *near[1:]]
+    static_states = states.copy()
+    score(cloud, points.subset(np.flatnonzero(points.weight == points.weight.max())), static_states, height_m, settings)
+    static_inliers: Float64[NDArray[np.float64], " n"] = static_states["inliers"]
+    chosen = _distinct(states, static_inliers, around)
+    local_poses = [
+        LocalPose(registered_of(states[k], found.hypothesis, cloud.origin_m), float(static_inliers[k])) for k in chosen
+    ]
+    return [replace(local_poses[0], pose=found), *local_poses[1:]]
 
 
 def _distinct(
-    states: NDArray[Any], still: Float64[NDArray[np.float64], " n"], around: LocalSearchSettings
+    states: NDArray[Any], static_inliers: Float64[NDArray[np.float64], " n"], around: LocalSearchSettings
 ) -> list[int]:
     """Row of the first state, then rows of the others to keep, those with the largest share of static inliers first."""
     heading = np.unwrap(np.arctan2(states["R"][:, 1, 0], states["R"][:, 0, 0]))
     at = np.c_[states["t"], around.arm_m * heading]
-    kept = [0]
-    for k in 1 + np.argsort(-still[1:], kind="stable"):
-        if np.linalg.norm(at[kept] - at[k], axis=1).min() >= around.apart_m:
-            kept.append(int(k))
-        if len(kept) > around.kept:
+    chosen = [0]
+    for k in 1 + np.argsort(-static_inliers[1:], kind="stable"):
+        if np.linalg.norm(at[chosen] - at[k], axis=1).min() >= around.apart_m:
+            chosen.append(int(k))
+        if len(chosen) > around.most_poses:
             break
-    return kept
+    return chosen

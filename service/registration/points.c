@@ -61,7 +61,7 @@ void streetfix_blocks(const float *depth, const Blocks *b, float *z)
     for (int64_t y = 0; y < b->size; y += b->skip)
         for (int64_t x = 0; x < b->size; x += b->skip) samples++;
     const int64_t count = network(samples, steps);
-    const int enough = samples + 1 > 2 ? (samples + 1) / 2 : 1;
+    const int least_measured = samples + 1 > 2 ? (samples + 1) / 2 : 1;
     float value[MOST_SAMPLES][LANES];
     int measured[LANES];
     for (int64_t row = 0; row < b->rows; row++)
@@ -71,12 +71,12 @@ void streetfix_blocks(const float *depth, const Blocks *b, float *z)
             int s = 0;
             for (int64_t y = 0; y < b->size; y += b->skip)
                 for (int64_t x = 0; x < b->size; x += b->skip, s++) {
-                    const float *from = depth + (row * b->size + y) * b->width + first * b->size + x;
+                    const float *source = depth + (row * b->size + y) * b->width + first * b->size + x;
                     for (int64_t k = 0; k < lanes; k++) {
-                        const float d = from[k * b->size];
-                        const int known = d > 0;
-                        value[s][k] = known ? 1.0f / d : INFINITY;
-                        measured[k] += known;
+                        const float d = source[k * b->size];
+                        const int valid = d > 0;
+                        value[s][k] = valid ? 1.0f / d : INFINITY;
+                        measured[k] += valid;
                     }
                     for (int64_t k = lanes; k < LANES; k++) value[s][k] = INFINITY;
                 }
@@ -92,12 +92,12 @@ void streetfix_blocks(const float *depth, const Blocks *b, float *z)
                 const int n = measured[k];
                 float *out = z + row * b->columns + first + k;
                 *out = 0;
-                if (n < enough) continue;
+                if (n < least_measured) continue;
                 const float low = value[(int)(0.1 * (n - 1))][k], high = value[(int)(0.9 * (n - 1))][k];
                 /* For an even number of values take the mean of the middle two. The lower one alone would bias all depths upwards. */
-                const float middle = 0.5f * (value[(int)(0.5 * (n - 1))][k] + value[n / 2][k]);
-                const float far = 1.0f / middle;
-                if ((double)(high - low) - 2.56 * b->noise < b->edge * (double)middle && far < (float)b->reach) *out = far;
+                const float median = 0.5f * (value[(int)(0.5 * (n - 1))][k] + value[n / 2][k]);
+                const float z_m = 1.0f / median;
+                if ((double)(high - low) - 2.56 * b->noise < b->edge * (double)median && z_m < (float)b->reach) *out = z_m;
             }
         }
 }

@@ -40,8 +40,10 @@ FOCAL_BASELINE_PX_M = 80.0
 
 
 class _Blocks(Structure):
-    _fields_ = [*((name, c_int64) for name in ("width", "size", "skip", "rows", "columns")),
-                *((name, c_double) for name in ("edge", "noise", "reach"))]  # fmt: skip
+    _fields_ = [
+        *((name, c_int64) for name in ("width", "size", "skip", "rows", "columns")),
+        *((name, c_double) for name in ("edge", "noise", "reach")),
+    ]
 
 
 @cache
@@ -172,9 +174,10 @@ def blocks_of(
     skip = max(1, size // 4)  # at most 49 pixels of a block are read
     depth_m, z = np.ascontiguousarray(depth_m, np.float32), np.empty((rows, columns), np.float32)
     _library().streetfix_blocks(
-        depth_m.ctypes.data, byref(_Blocks(width, size, skip, rows, columns, settings.edge, noise, settings.reach_m)),
+        depth_m.ctypes.data,
+        byref(_Blocks(width, size, skip, rows, columns, settings.edge, noise, settings.reach_m)),
         z.ctypes.data,
-    )  # fmt: skip
+    )
     centre_px = float(np.arange(0, size, skip).mean())  # the centre of the pixels read, which is not the block's
     small = PinholeCamera(
         columns, rows, own.fx / size, own.fy / size, (own.cx - centre_px) / size, (own.cy - centre_px) / size
@@ -183,9 +186,15 @@ def blocks_of(
 
 
 def points_of(
-    depth_m: Float32[NDArray[np.float32], "H W"], camera: PinholeCamera, R_level_camera: Rotation, height_m: float,
-    settings: PointSettings, *, noise: float | None = None, focal_baseline_px_m: float = FOCAL_BASELINE_PX_M,
-) -> QueryPoints:  # fmt: skip
+    depth_m: Float32[NDArray[np.float32], "H W"],
+    camera: PinholeCamera,
+    R_level_camera: Rotation,
+    height_m: float,
+    settings: PointSettings,
+    *,
+    noise: float | None = None,
+    focal_baseline_px_m: float = FOCAL_BASELINE_PX_M,
+) -> QueryPoints:
     """Thin a depth image to points in its level frame.
 
     Args:
@@ -203,9 +212,14 @@ def points_of(
 
 
 def points_from(
-    blocks: DepthBlocks, R_level_camera: Rotation, height_m: float, settings: PointSettings, *, noise: float,
+    blocks: DepthBlocks,
+    R_level_camera: Rotation,
+    height_m: float,
+    settings: PointSettings,
+    *,
+    noise: float,
     focal_baseline_px_m: float,
-) -> QueryPoints:  # fmt: skip
+) -> QueryPoints:
     """Convert the blocks of a depth image to points in its level frame.
 
     Args:
@@ -228,9 +242,12 @@ def points_from(
     movable = _may_move(xyz[:, 2] + height_m, settings)
     f = np.float32
     return QueryPoints(
-        xyz=xyz.astype(f), ray=(level / length[:, None]).astype(f), sigma=sigma.astype(f),
-        weight=np.where(movable, settings.movable_weight, 1.0).astype(f), q=(z / focal_baseline_px_m).astype(f),
-    )  # fmt: skip
+        xyz=xyz.astype(f),
+        ray=(level / length[:, None]).astype(f),
+        sigma=sigma.astype(f),
+        weight=np.where(movable, settings.movable_weight, 1.0).astype(f),
+        q=(z / focal_baseline_px_m).astype(f),
+    )
 
 
 def movable_of(

@@ -41,14 +41,15 @@ class RaySettings(DiscSettings):
     Attributes:
         rounds: largest number of rounds. Each round casts the rays once.
         steps: solver steps per round.
-        still_m: the adjustment ends after a round that moves the pose by less than this, m, and
-        still_rad: rotates it by less than this, rad.
+        converged_m: largest movement of a round after which the adjustment ends, m. Both limits must hold.
+        converged_rad: largest rotation of a round after which the adjustment ends, rad.
         surface_m: standard deviation of the map's surfaces along a ray, m.
         robust: width of the robust kernel (Geman and McClure), in standard deviations. There a pixel keeps a quarter of its weight.
         patch: edge of a patch, pixels of the small image.
         shared: standard deviation of the error that a patch's pixels share, as a multiple of one pixel's noise.
         moved_m: standard deviation of the distance that an object may have moved since the survey, m. Pixels of a patch share it.
-        alike: effective-sample-size divisor: correlated pixels per independent measurement. It scales the pixels against the priors.
+        correlated_pixels: number of correlated pixels that count as one independent measurement. It scales the pixels against the
+            priors.
         position_m: standard deviation of the prior of position, m. Its mean is the pose to adjust.
         turn_rad: standard deviation of the prior of rotation, rad. Its mean is the pose to adjust.
         scale: standard deviation of the prior of the log scale of depth. Its mean is 0.
@@ -58,14 +59,14 @@ class RaySettings(DiscSettings):
 
     rounds: int = 5
     steps: int = 2
-    still_m: float = 0.02
-    still_rad: float = 1e-3
+    converged_m: float = 0.02
+    converged_rad: float = 1e-3
     surface_m: float = 0.05
     robust: float = 1.5
     patch: int = 6
     shared: float = 1.0
     moved_m: float = 1.0
-    alike: float = 8.0
+    correlated_pixels: float = 8.0
     position_m: float = 1.0
     turn_rad: float = float(np.deg2rad(2.0))
     scale: float = 0.01
@@ -124,9 +125,9 @@ def picture_of(
     return RayPicture(inverse, blocks.camera, T_level_camera, noise, focal_baseline_px_m, movable)
 
 
-class _Asked(Structure):
-    _fields_ = [("about", c_double * 3), *((name, c_double) for name in (
-        "scale", "offset", "unit", "noise", "surface", "robust", "shared", "moved", "nearest",
+class _DepthModel(Structure):
+    _fields_ = [("centre", c_double * 3), *((name, c_double) for name in (
+        "scale", "offset", "per_offset", "noise", "surface", "robust", "shared", "moved", "nearest",
         "reach", "grazing")), ("patch", c_int64)]  # fmt: skip
 
 
@@ -134,13 +135,13 @@ class _Asked(Structure):
 def _library() -> ctypes.CDLL:
     library = load(
         LIBRARY,
-        {"Surfel": SURFEL, "View": View, "Asked": _Asked},
+        {"Surfel": SURFEL, "View": View, "DepthModel": _DepthModel},
         {"UNKNOWNS": UNKNOWNS, "MOST_PIXELS": MOST_PATCH**2},
     )
-    library.streetfix_pull.argtypes = [
-        c_void_p, POINTER(View), c_void_p, c_void_p, c_void_p, POINTER(_Asked), c_void_p, c_void_p, c_void_p, POINTER(c_double)
+    library.streetfix_normal_equations.argtypes = [
+        c_void_p, POINTER(View), c_void_p, c_void_p, c_void_p, POINTER(_DepthModel), c_void_p, c_void_p, c_void_p, POINTER(c_double)
     ]  # fmt: skip
-    library.streetfix_pull.restype = c_int64
+    library.streetfix_normal_equations.restype = c_int64
     return library
 
 
@@ -155,8 +156,11 @@ class _State:
 
     def moved(self, step: Float64[NDArray[np.float64], "8"]) -> "_State":
         return _State(
-            _turned_by(step[3:6]) @ self.R, self.t + step[:3], self.log_scale + float(step[6]), self.offset + float(step[7])
-        )  # fmt: skip
+            _rotation_of(step[3:6]) @ self.R,
+            self.t + step[:3],
+            self.log_scale + float(step[6]),
+            self.offset + float(step[7]),
+        )
 
     def camera_of(self, picture: RayPicture) -> Transform:
         T: Transform = transform_from(self.R, self.t) @ picture.T_level_camera
@@ -164,7 +168,7 @@ class _State:
 
 
 @dataclass(frozen=True, slots=True)
-class _Pull:
+class _NormalEquations:
     """Normal equations of all pixels, scatter of the patches' gradients (0 if not requested), number of pixels used, and error."""
 
     H: Float64[NDArray[np.float64], "8 8"]
@@ -174,21 +178,21 @@ class _Pull:
     error: float
 
 
-def met_by(
-    sights: SurfelRaycaster, pictures: list[RayPicture], found: Registered
+def cast_rays(
+    raycaster: SurfelRaycaster, pictures: list[RayPicture], found: Registered
 ) -> list[Int32[NDArray[np.int32], "H W"]]:
-    """Cast the rays of all images from a registered pose (``SurfelRaycaster.meet``).
+    """Cast the rays of all images from a registered pose (``SurfelRaycaster.intersect``).
 
     Args:
-        sights: ray casting on the map.
+        raycaster: ray casting on the map.
         pictures: images of the query, the reference's first.
         found: registered pose of the reference's level frame, map frame.
 
     Returns:
         For each image the index of the surfel in each pixel, -1 for none.
     """
-    state = _state_of(sights.cloud, found)
-    return [sights.meet(state.camera_of(picture), picture.camera) for picture in pictures]
+    state = _state_of(raycaster.cloud, found)
+    return [raycaster.intersect(state.camera_of(picture), picture.camera) for picture in pictures]
 
 
 def _state_of(cloud: SurfelMap, found: Registered) -> _State:
@@ -196,12 +200,12 @@ def _state_of(cloud: SurfelMap, found: Registered) -> _State:
 
 
 def adjust(
-    sights: SurfelRaycaster, pictures: list[RayPicture], found: Registered, settings: RaySettings
+    raycaster: SurfelRaycaster, pictures: list[RayPicture], found: Registered, settings: RaySettings
 ) -> tuple[Registered, Float64[NDArray[np.float64], "8 8"]] | None:
     """Adjust a registered pose so that the measured inverse depths of all images agree best with the map along their rays.
 
     Args:
-        sights: ray casting on the map, with the same settings.
+        raycaster: ray casting on the map, with the same settings.
         pictures: images of the query, the reference's first.
         found: registered pose of the reference's level frame, map frame.
         settings: of the adjustment.
@@ -211,7 +215,7 @@ def adjust(
         The pose's ``information`` excludes the priors.
         None if fewer than ``settings.fewest`` pixels intersect the map.
     """
-    cloud, state = sights.cloud, _state_of(sights.cloud, found)
+    cloud, state = raycaster.cloud, _state_of(raycaster.cloud, found)
     free = np.ones(UNKNOWNS, bool)
     free[7] = pictures[0].focal_baseline_px_m is not None
     sigma = np.r_[np.full(3, settings.position_m), np.full(3, settings.turn_rad), settings.scale, settings.offset_px]
@@ -220,63 +224,94 @@ def adjust(
     converged, iterations = False, 0
     for _ in range(settings.rounds):
         before = moved
-        met = [sights.meet(state.camera_of(picture), picture.camera) for picture in pictures]
+        hits = [raycaster.intersect(state.camera_of(picture), picture.camera) for picture in pictures]
         for _ in range(settings.steps):
-            pull = _pull(cloud, pictures, met, state, settings)
-            if pull.pixels < settings.fewest:
+            equations = _normal_equations(cloud, pictures, hits, state, settings)
+            if equations.pixels < settings.fewest:
                 return None
-            told, wanted = pull.H / settings.alike + prior, pull.b / settings.alike - prior @ moved
+            H = equations.H / settings.correlated_pixels + prior
+            b = equations.b / settings.correlated_pixels - prior @ moved
             step = np.zeros(UNKNOWNS)
-            step[free] = np.linalg.solve(told[np.ix_(free, free)], wanted[free])
+            step[free] = np.linalg.solve(H[np.ix_(free, free)], b[free])
             state, moved, iterations = state.moved(step), moved + step, iterations + 1
-        went = np.linalg.norm((moved - before)[:6].reshape(2, 3), axis=1)
-        if converged := bool(went[0] < settings.still_m and went[1] < settings.still_rad):
+        change = np.linalg.norm((moved - before)[:6].reshape(2, 3), axis=1)
+        if converged := bool(change[0] < settings.converged_m and change[1] < settings.converged_rad):
             break
-    pull = _pull(cloud, pictures, met, state, settings, scattered=True)
+    equations = _normal_equations(cloud, pictures, hits, state, settings, with_scatter=True)
     pose = replace(
-        found, R_map_level=state.R, camera_m=state.t + cloud.origin_m, scale=float(np.exp(state.log_scale)),
-        offset=state.offset, information=pull.H, converged=converged, iterations=iterations, error=pull.error,
-    )  # fmt: skip
-    return pose, pull.scatter
+        found,
+        R_map_level=state.R,
+        camera_m=state.t + cloud.origin_m,
+        scale=float(np.exp(state.log_scale)),
+        offset=state.offset,
+        information=equations.H,
+        converged=converged,
+        iterations=iterations,
+        error=equations.error,
+    )
+    return pose, equations.scatter
 
 
-def _pull(
-    cloud: SurfelMap, pictures: list[RayPicture], met: list[Int32[NDArray[np.int32], "H W"]], state: _State, settings: RaySettings, *,
-    scattered: bool = False,
-) -> _Pull:  # fmt: skip
+def _normal_equations(
+    cloud: SurfelMap,
+    pictures: list[RayPicture],
+    hits: list[Int32[NDArray[np.int32], "H W"]],
+    state: _State,
+    settings: RaySettings,
+    *,
+    with_scatter: bool = False,
+) -> _NormalEquations:
     H, b, scatter, pixels = np.zeros((UNKNOWNS, UNKNOWNS)), np.zeros(UNKNOWNS), np.zeros((UNKNOWNS, UNKNOWNS)), 0
     error = c_double(0.0)
-    for picture, surfels in zip(pictures, met, strict=True):
+    for picture, surfels in zip(pictures, hits, strict=True):
         camera, rig = picture.camera, picture.focal_baseline_px_m
         down, across = (-(-side // settings.patch) for side in (camera.height, camera.width))
-        pulls = np.zeros((down, across, UNKNOWNS))
-        asked = _Asked(
-            (c_double * 3)(*state.t), float(np.exp(state.log_scale)), state.offset, 0.0 if rig is None else 1.0 / rig,
-            picture.noise, settings.surface_m, settings.robust, settings.shared * picture.noise, settings.moved_m, settings.nearest_m,
-            settings.reach_m, settings.grazing, settings.patch,
-        )  # fmt: skip
+        gradients = np.zeros((down, across, UNKNOWNS))
+        model = _DepthModel(
+            (c_double * 3)(*state.t),
+            float(np.exp(state.log_scale)),
+            state.offset,
+            0.0 if rig is None else 1.0 / rig,
+            picture.noise,
+            settings.surface_m,
+            settings.robust,
+            settings.shared * picture.noise,
+            settings.moved_m,
+            settings.nearest_m,
+            settings.reach_m,
+            settings.grazing,
+            settings.patch,
+        )
         view = View.of(state.camera_of(picture), camera)
-        pixels += _library().streetfix_pull(
-            cloud.surfels.ctypes.data, byref(view), surfels.ctypes.data, picture.inverse.ctypes.data, picture.movable.ctypes.data,
-            byref(asked), H.ctypes.data, b.ctypes.data, pulls.ctypes.data, byref(error),
-        )  # fmt: skip
-        if scattered:
-            scatter += _scattered(pulls)
-    return _Pull(H, b, scatter, int(pixels), error.value)
+        pixels += _library().streetfix_normal_equations(
+            cloud.surfels.ctypes.data,
+            byref(view),
+            surfels.ctypes.data,
+            picture.inverse.ctypes.data,
+            picture.movable.ctypes.data,
+            byref(model),
+            H.ctypes.data,
+            b.ctypes.data,
+            gradients.ctypes.data,
+            byref(error),
+        )
+        if with_scatter:
+            scatter += _scatter_of(gradients)
+    return _NormalEquations(H, b, scatter, int(pixels), error.value)
 
 
-def _scattered(pulls: NDArray[np.float64]) -> NDArray[np.float64]:
+def _scatter_of(gradients: NDArray[np.float64]) -> NDArray[np.float64]:
     """Sum of the outer products of the gradients, joined over 2 x 2 patches because a car that has moved is as wide.
 
     The factor for few patches is as in ``score_outer_product``.
     """
-    padded = np.pad(pulls, [(0, pulls.shape[0] % 2), (0, pulls.shape[1] % 2), (0, 0)])
+    padded = np.pad(gradients, [(0, gradients.shape[0] % 2), (0, gradients.shape[1] % 2), (0, 0)])
     joint = (padded[0::2, 0::2] + padded[1::2, 0::2] + padded[0::2, 1::2] + padded[1::2, 1::2]).reshape(-1, UNKNOWNS)
-    told = int((joint != 0).any(axis=1).sum())
-    return joint.T @ joint * (told / max(told - UNKNOWNS, 1))
+    count = int((joint != 0).any(axis=1).sum())
+    return joint.T @ joint * (count / max(count - UNKNOWNS, 1))
 
 
-def _turned_by(vector_rad: Float64[NDArray[np.float64], "3"]) -> Rotation:
+def _rotation_of(vector_rad: Float64[NDArray[np.float64], "3"]) -> Rotation:
     """Right-handed rotation about a vector by its length in radians (Rodrigues' formula)."""
     angle = float(np.linalg.norm(vector_rad))
     x, y, z = vector_rad

@@ -144,21 +144,31 @@ def register(
     states, owner = _states(cloud, starts, settings)
     ground = settings.ground_m - height_m
     align(
-        cloud.grid, cloud.surfels, points.thinned(settings.coarse_points), states, settings.coarse, tolerance_m=0.3,
+        cloud.grid,
+        cloud.surfels,
+        points.thinned(settings.coarse_points),
+        states,
+        settings.coarse,
+        tolerance_m=0.3,
         height_min_m=ground,
-    )  # fmt: skip
+    )
     kept = _best_of_each(states, owner, settings)
     best, owner = states[kept].copy(), owner[kept]
     align(
-        cloud.grid, cloud.surfels, points.thinned(settings.middle_points), best, settings.middle,
-        tolerance_m=settings.tolerance_m, height_min_m=ground,
-    )  # fmt: skip
+        cloud.grid,
+        cloud.surfels,
+        points.thinned(settings.middle_points),
+        best,
+        settings.middle,
+        tolerance_m=settings.tolerance_m,
+        height_min_m=ground,
+    )
     similar = {start.hypothesis: start.similarity for start in starts}
     similarity = np.array([similar[int(hypothesis)] for hypothesis in owner])
     promise = best["inliers"] + settings.similarity_weight * similarity
     kept = _distinct(best, promise, settings.refined, settings.apart_m)
     best, owner = best[kept].copy(), owner[kept]
-    align(cloud.grid, cloud.surfels, points.weighing_at_least(settings.fine_weight), best, settings.fine)
+    align(cloud.grid, cloud.surfels, points.with_least_weight(settings.fine_weight), best, settings.fine)
     score(cloud, points, best, height_m, settings)
     order = np.argsort(-best["inliers"], kind="stable")
     return tuple(registered_of(best[k], int(owner[k]), cloud.origin_m) for k in order)
@@ -178,9 +188,14 @@ def score(
     """
     score_only = replace(settings.fine, iterations=0)
     align(
-        cloud.grid, cloud.surfels, points, states, score_only, tolerance_m=settings.tolerance_m,
+        cloud.grid,
+        cloud.surfels,
+        points,
+        states,
+        score_only,
+        tolerance_m=settings.tolerance_m,
         height_min_m=settings.ground_m - height_m,
-    )  # fmt: skip
+    )
 
 
 def registered_of(state: Any, hypothesis: int, origin_m: Float64[NDArray[np.float64], "3"]) -> Registered:
@@ -192,9 +207,17 @@ def registered_of(state: Any, hypothesis: int, origin_m: Float64[NDArray[np.floa
         origin_m: origin of the surfels' frame, map frame, m.
     """
     return Registered(
-        state["R"].copy(), state["t"] + origin_m, float(np.exp(state["log_scale"])), float(state["offset"]), float(state["inliers"]),
-        state["information"].copy(), hypothesis, bool(state["converged"]), int(state["iterations"]), float(state["error"]),
-    )  # fmt: skip
+        state["R"].copy(),
+        state["t"] + origin_m,
+        float(np.exp(state["log_scale"])),
+        float(state["offset"]),
+        float(state["inliers"]),
+        state["information"].copy(),
+        hypothesis,
+        bool(state["converged"]),
+        int(state["iterations"]),
+        float(state["error"]),
+    )
 
 
 def _states(

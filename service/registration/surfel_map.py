@@ -25,9 +25,13 @@ _FLOATS, _NUMBERS, _BRIGHT = np.dtype("<f8"), np.dtype("<i4"), np.dtype("<f4")
 BRIGHTNESS = "brightness"
 #: Type and shape of every other array by name; -1 is any length.
 _EXPECTED: dict[str, tuple[np.dtype[Any], tuple[int, ...]]] = {
-    "origin": (_FLOATS, (3,)), "surfels": (SURFEL, (-1,)), "tiles": (_FLOATS, (-1, 4)),
-    "grid_frame": (_FLOATS, (4,)), "grid_block": (_NUMBERS, (-1, -1, -1)), "grid_nearest": (_NUMBERS, (-1, BLOCK**3)),
-}  # fmt: skip
+    "origin": (_FLOATS, (3,)),
+    "surfels": (SURFEL, (-1,)),
+    "tiles": (_FLOATS, (-1, 4)),
+    "grid_frame": (_FLOATS, (4,)),
+    "grid_block": (_NUMBERS, (-1, -1, -1)),
+    "grid_nearest": (_NUMBERS, (-1, BLOCK**3)),
+}
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -52,9 +56,12 @@ class SurfelMap:
 
     @classmethod
     def prepare(
-        cls, origin_m: Float64[NDArray[np.float64], "3"], surfels: NDArray[Any], tiles: Float64[NDArray[np.float64], "n 4"],
+        cls,
+        origin_m: Float64[NDArray[np.float64], "3"],
+        surfels: NDArray[Any],
+        tiles: Float64[NDArray[np.float64], "n 4"],
         brightness: Float32[NDArray[np.float32], " s"] | None = None,
-    ) -> "SurfelMap":  # fmt: skip
+    ) -> "SurfelMap":
         """Build the lookup grid of a map; this takes seconds for a district.
 
         Args:
@@ -76,10 +83,13 @@ class SurfelMap:
             also has brightness (S,). ``grid_frame`` holds the grid's origin and the edge of its cells, m.
         """
         arrays = {
-            "origin": self.origin_m, "surfels": self.surfels, "tiles": self.tiles,
-            "grid_frame": np.array([*self.grid.origin_m, self.grid.cell_m]), "grid_block": self.grid.block,
+            "origin": self.origin_m,
+            "surfels": self.surfels,
+            "tiles": self.tiles,
+            "grid_frame": np.array([*self.grid.origin_m, self.grid.cell_m]),
+            "grid_block": self.grid.block,
             "grid_nearest": self.grid.nearest,
-        }  # fmt: skip
+        }
         return arrays if self.brightness is None else arrays | {BRIGHTNESS: self.brightness}
 
     @classmethod

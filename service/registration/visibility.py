@@ -26,7 +26,7 @@ LIBRARY = Path(__file__).with_name("_rays.so")
 #: Largest distance (m) and rotation (rad) of a pose from the one whose collected surfels it reuses.
 NEAR_M, NEAR_RAD = 2.0, 0.1
 #: Number of collections to keep, the last used ones. Each takes one or two megabytes, and a request has at most 16 frames.
-KEPT = 16
+MOST_COLLECTIONS = 16
 #: Margin added to both limits (m, rad), so that rounding loses no surfel.
 ROUNDING = 1e-3
 
@@ -37,14 +37,14 @@ class DiscSettings:
 
     Attributes:
         radius_m: radius of a surfel's disc, m.
-        behind_m: discs up to this depth behind the first one on a ray may be the same surface, m.
+        same_surface_m: discs up to this depth behind the first one on a ray may be the same surface, m.
         grazing: least cosine between a disc's normal and the line of sight; rays ignore discs seen flatter.
         nearest_m: least depth that counts, m.
         reach_m: largest depth that counts, m.
     """
 
     radius_m: float = 0.2
-    behind_m: float = 0.3
+    same_surface_m: float = 0.3
     grazing: float = 0.05
     nearest_m: float = 0.5
     reach_m: float = 40.0
@@ -52,15 +52,24 @@ class DiscSettings:
 
 #: Work memory for one surfel in the camera's axes: position, normal, index, and the range of pixels that it may cover.
 _DISC = np.dtype(
-    [("xyz", "<f4", (3,)), ("normal", "<f4", (3,)), *((name, "<i4") for name in ("number", "left", "right", "top", "bottom"))]
-)  # fmt: skip
+    [
+        ("xyz", "<f4", (3,)),
+        ("normal", "<f4", (3,)),
+        *((name, "<i4") for name in ("number", "left", "right", "top", "bottom")),
+    ]
+)
 
 
 class View(Structure):
     """Intrinsics and pose of a small image's camera, as ``rays.c`` takes them."""
 
-    _fields_ = [("R", c_double * 9), ("t", c_double * 3), *((name, c_double) for name in ("fx", "fy", "cx", "cy")),
-                ("width", c_int64), ("height", c_int64)]  # fmt: skip
+    _fields_ = [
+        ("R", c_double * 9),
+        ("t", c_double * 3),
+        *((name, c_double) for name in ("fx", "fy", "cx", "cy")),
+        ("width", c_int64),
+        ("height", c_int64),
+    ]
 
     @classmethod
     def of(cls, T_map_camera: Transform, camera: PinholeCamera) -> "View":
@@ -71,31 +80,53 @@ class View(Structure):
             camera: intrinsics of the small image.
         """
         return cls(
-            (c_double * 9)(*T_map_camera[:3, :3].ravel()), (c_double * 3)(*T_map_camera[:3, 3]), camera.fx, camera.fy, camera.cx,
-            camera.cy, camera.width, camera.height,
-        )  # fmt: skip
+            (c_double * 9)(*T_map_camera[:3, :3].ravel()),
+            (c_double * 3)(*T_map_camera[:3, 3]),
+            camera.fx,
+            camera.fy,
+            camera.cx,
+            camera.cy,
+            camera.width,
+            camera.height,
+        )
 
 
 class _Discs(Structure):
-    _fields_ = [(name, c_double) for name in ("radius", "nearest", "reach", "behind", "grazing")]
+    _fields_ = [(name, c_double) for name in ("radius", "nearest", "reach", "same_surface", "grazing")]
 
 
 @cache
 def _library() -> ctypes.CDLL:
     library = load(LIBRARY, {"Surfel": SURFEL, "View": View, "Discs": _Discs, "Disc": _DISC})
-    library.streetfix_gather.argtypes = [
-        c_void_p, c_void_p, c_int64, POINTER(View), POINTER(_Discs), c_double, c_double, c_void_p, c_void_p
-    ]  # fmt: skip
-    library.streetfix_gather.restype = c_int64
-    library.streetfix_meet.argtypes = [
-        c_void_p, c_void_p, c_int64, POINTER(View), POINTER(_Discs), c_void_p, c_void_p, c_void_p, c_void_p
-    ]  # fmt: skip
-    library.streetfix_meet.restype = None
+    library.streetfix_collect.argtypes = [
+        c_void_p,
+        c_void_p,
+        c_int64,
+        POINTER(View),
+        POINTER(_Discs),
+        c_double,
+        c_double,
+        c_void_p,
+        c_void_p,
+    ]
+    library.streetfix_collect.restype = c_int64
+    library.streetfix_intersect.argtypes = [
+        c_void_p,
+        c_void_p,
+        c_int64,
+        POINTER(View),
+        POINTER(_Discs),
+        c_void_p,
+        c_void_p,
+        c_void_p,
+        c_void_p,
+    ]
+    library.streetfix_intersect.restype = None
     return library
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Gathered:
+class _Collection:
     """Surfels that a camera may see from near a pose, in the map's order, and their indices in the map."""
 
     T_map_camera: Transform
@@ -103,7 +134,7 @@ class _Gathered:
     surfels: NDArray[Any]
     numbers: Int32[NDArray[np.int32], " n"]
 
-    def holds(self, T_map_camera: Transform, camera: PinholeCamera) -> bool:
+    def covers(self, T_map_camera: Transform, camera: PinholeCamera) -> bool:
         """Whether these surfels include all that the camera sees from a pose."""
         if camera != self.camera or np.linalg.norm(T_map_camera[:3, 3] - self.T_map_camera[:3, 3]) > NEAR_M:
             return False
@@ -129,47 +160,62 @@ class SurfelRaycaster:
         self.cloud = cloud
         self._settings = settings
         self._discs = _Discs(
-            settings.radius_m, settings.nearest_m, settings.reach_m, settings.behind_m, settings.grazing
+            settings.radius_m, settings.nearest_m, settings.reach_m, settings.same_surface_m, settings.grazing
         )
-        self._gathered: list[_Gathered] = []
-        self._met: dict[tuple[bytes, PinholeCamera], Int32[NDArray[np.int32], "H W"]] = {}
+        self._collections: list[_Collection] = []
+        self._results: dict[tuple[bytes, PinholeCamera], Int32[NDArray[np.int32], "H W"]] = {}
 
-    def meet(self, T_map_camera: Transform, camera: PinholeCamera) -> Int32[NDArray[np.int32], "H W"]:
+    def intersect(self, T_map_camera: Transform, camera: PinholeCamera) -> Int32[NDArray[np.int32], "H W"]:
         """Return the index of the surfel that each pixel's ray intersects, -1 for none.
 
         Args:
             T_map_camera: pose of the camera in the surfels' frame.
             camera: intrinsics of the small image.
         """
-        asked = T_map_camera.tobytes(), camera
-        if asked not in self._met:
-            self._met[asked] = self._look_up(T_map_camera, camera)
-        return self._met[asked]
+        key = T_map_camera.tobytes(), camera
+        if key not in self._results:
+            self._results[key] = self._cast(T_map_camera, camera)
+        return self._results[key]
 
-    def _look_up(self, T_map_camera: Transform, camera: PinholeCamera) -> Int32[NDArray[np.int32], "H W"]:
-        near = next((each for each in self._gathered if each.holds(T_map_camera, camera)), None)
-        if near is None:
-            near = self._gather(T_map_camera, camera)
-        self._gathered = [each for each in self._gathered if each is not near][1 - KEPT :] + [near]
-        seen, met = np.empty(len(near.surfels), _DISC), np.empty((camera.height, camera.width), np.int32)
-        first, middle = np.empty((2, camera.height * camera.width), np.float32)
-        _library().streetfix_meet(
-            near.surfels.ctypes.data, near.numbers.ctypes.data, len(near.surfels), byref(View.of(T_map_camera, camera)),
-            byref(self._discs), seen.ctypes.data, first.ctypes.data, middle.ctypes.data, met.ctypes.data,
-        )  # fmt: skip
-        return met
+    def _cast(self, T_map_camera: Transform, camera: PinholeCamera) -> Int32[NDArray[np.int32], "H W"]:
+        collection = next((each for each in self._collections if each.covers(T_map_camera, camera)), None)
+        if collection is None:
+            collection = self._collect(T_map_camera, camera)
+        others = [each for each in self._collections if each is not collection]
+        self._collections = [*others[1 - MOST_COLLECTIONS :], collection]
+        discs, surfel_of = np.empty(len(collection.surfels), _DISC), np.empty((camera.height, camera.width), np.int32)
+        nearest, centre_distance2 = np.empty((2, camera.height * camera.width), np.float32)
+        _library().streetfix_intersect(
+            collection.surfels.ctypes.data,
+            collection.numbers.ctypes.data,
+            len(collection.surfels),
+            byref(View.of(T_map_camera, camera)),
+            byref(self._discs),
+            discs.ctypes.data,
+            nearest.ctypes.data,
+            centre_distance2.ctypes.data,
+            surfel_of.ctypes.data,
+        )
+        return surfel_of
 
-    def _gather(self, T_map_camera: Transform, camera: PinholeCamera) -> _Gathered:
+    def _collect(self, T_map_camera: Transform, camera: PinholeCamera) -> _Collection:
         parts = self._tiles_in_view(T_map_camera, camera)
         room = int(parts[:, 1].sum())
         surfels, numbers = np.empty(room, SURFEL), np.empty(room, np.int32)
-        count = _library().streetfix_gather(
-            self.cloud.surfels.ctypes.data, parts.ctypes.data, len(parts), byref(View.of(T_map_camera, camera)),
-            byref(self._discs), NEAR_M + ROUNDING, NEAR_RAD + ROUNDING, surfels.ctypes.data, numbers.ctypes.data,
-        )  # fmt: skip
+        count = _library().streetfix_collect(
+            self.cloud.surfels.ctypes.data,
+            parts.ctypes.data,
+            len(parts),
+            byref(View.of(T_map_camera, camera)),
+            byref(self._discs),
+            NEAR_M + ROUNDING,
+            NEAR_RAD + ROUNDING,
+            surfels.ctypes.data,
+            numbers.ctypes.data,
+        )
         for each in (surfels, numbers):
             each.resize(count, refcheck=False)  # frees the unused memory
-        return _Gathered(T_map_camera, camera, surfels, numbers)
+        return _Collection(T_map_camera, camera, surfels, numbers)
 
     def _tiles_in_view(self, T_map_camera: Transform, camera: PinholeCamera) -> NDArray[np.int64]:
         """First surfel and number of surfels of the tiles that a camera may see from near a pose: (tiles, 2).
@@ -181,10 +227,10 @@ class SurfelRaycaster:
         x, y = np.meshgrid((u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy)
         corners = self._settings.reach_m * np.stack([x.ravel(), y.ravel(), np.ones(4)], axis=1) @ T_map_camera[:3, :3].T
         hull = np.vstack([np.zeros(2), corners[:, :2]])
-        away = self.cloud.tiles[:, :2] - T_map_camera[:2, 3]
-        moved = NEAR_M + NEAR_RAD * float(np.linalg.norm(corners, axis=1).max())
-        half = TILE_M / np.sqrt(2) + self._settings.radius_m + moved
-        seen = np.ones(len(away), bool)
+        centres = self.cloud.tiles[:, :2] - T_map_camera[:2, 3]
+        motion_m = NEAR_M + NEAR_RAD * float(np.linalg.norm(corners, axis=1).max())
+        half = TILE_M / np.sqrt(2) + self._settings.radius_m + motion_m
+        visible = np.ones(len(centres), bool)
         for one, other in combinations(range(len(hull)), 2):
             along = hull[other] - hull[one]
             length = np.hypot(*along)
@@ -194,5 +240,5 @@ class SurfelRaycaster:
             sides = (hull - hull[one]) @ outward
             for sign in (1.0, -1.0):
                 if (sign * sides <= 1e-6).all():  # an edge of the hull: all points lie on its inner side
-                    seen &= sign * ((away - hull[one]) @ outward) <= half
-        return np.ascontiguousarray(self.cloud.tiles[seen, 2:4].astype(np.int64))
+                    visible &= sign * ((centres - hull[one]) @ outward) <= half
+        return np.ascontiguousarray(self.cloud.tiles[visible, 2:4].astype(np.int64))

@@ -22,8 +22,10 @@ Descriptors = Float32[NDArray[np.float32], "B D"]
 #: Execution providers that a setting can choose, and their names in ONNX Runtime.
 Provider = Literal["cpu", "cuda", "openvino"]
 _PROVIDERS: dict[Provider, str] = {
-    "cpu": "CPUExecutionProvider", "cuda": "CUDAExecutionProvider", "openvino": "OpenVINOExecutionProvider",
-}  # fmt: skip
+    "cpu": "CPUExecutionProvider",
+    "cuda": "CUDAExecutionProvider",
+    "openvino": "OpenVINOExecutionProvider",
+}
 #: Package that contains each provider. It replaces ``onnxruntime``.
 _PACKAGES: dict[Provider, str] = {"cpu": "onnxruntime", "cuda": "onnxruntime-gpu", "openvino": "onnxruntime-openvino"}
 #: Threads of one run. The service runs whole requests in parallel, and inner thread pools would compete with them.

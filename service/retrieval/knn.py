@@ -73,8 +73,8 @@ def search_views(
     Args:
         bundle: the map.
         descriptors: descriptors of the query views, one row per turn.
-        turns_rad: turns of the query views, counter-clockwise against the optical axis. The heading of a match is that of the map
-            view minus the turn.
+        turns_rad: turns of the query views, counter-clockwise against the optical axis, rad. The heading of a match is that of the
+            map view minus the turn.
         places: number of distinct places to find, if the map has as many.
         fewest: smallest number of views to find.
     """
@@ -131,9 +131,12 @@ def distinct_places(matches: ViewMatches, count: int) -> tuple[Neighbour, ...]:
     rows = np.sort(first)[:count]
     similarity = matches.similarity[rows]
     columns = (
-        matches.place[rows], similarity, np.sqrt(np.maximum(0.0, 2.0 - 2.0 * similarity)), matches.street[rows],
+        matches.place[rows],
+        similarity,
+        np.sqrt(np.maximum(0.0, 2.0 - 2.0 * similarity)),
+        matches.street[rows],
         matches.heading_rad[rows],
-    )  # fmt: skip
+    )
     positions_m = matches.T_map_place[rows, :3, 3]
     return tuple(
         Neighbour(

@@ -17,8 +17,8 @@ class Prior:
     Attributes:
         position_m: x and y in the map frame; None if only the heading is known.
         position_std_m: standard deviation of each coordinate.
-        heading_rad: heading of the optical axis, counter-clockwise from map x; None if unknown.
-        heading_std_rad: standard deviation of the heading.
+        heading_rad: heading of the optical axis, counter-clockwise from map x, rad; None if unknown.
+        heading_std_rad: standard deviation of the heading, rad.
     """
 
     position_m: Float64[NDArray[np.float64], "2"] | None = None
@@ -36,7 +36,7 @@ class Prior:
 
         Args:
             xy: positions of the camera, map frame, metres.
-            heading_rad: headings of the optical axis, counter-clockwise from map x.
+            heading_rad: headings of the optical axis, counter-clockwise from map x, rad.
         """
         squared = np.zeros(len(xy))
         if self.position_m is not None:
@@ -56,7 +56,7 @@ class Prior:
 
         Args:
             xy: position of the answer, map frame, metres.
-            heading_rad: heading of the answer's optical axis, counter-clockwise from map x.
+            heading_rad: heading of the answer's optical axis, counter-clockwise from map x, rad.
         """
         if self.position_m is None:
             return 0.0

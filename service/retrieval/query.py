@@ -87,8 +87,14 @@ class DepthFormat:
 
 
 def decoded_query(
-    rgb: bytes, depth: bytes, camera: PinholeCamera, depth_format: DepthFormat, *, grid: ViewGrid, limits: ImageLimits = DEFAULT_LIMITS
-) -> Query:  # fmt: skip
+    rgb: bytes,
+    depth: bytes,
+    camera: PinholeCamera,
+    depth_format: DepthFormat,
+    *,
+    grid: ViewGrid,
+    limits: ImageLimits = DEFAULT_LIMITS,
+) -> Query:
     """Decode an image pair to a query that has the default options.
 
     Args:
@@ -104,8 +110,14 @@ def decoded_query(
     """
     colour = decode_rgb(rgb, limits=limits, camera=camera, finest_rad=finest_rad(grid))
     depth_m = decode_depth(
-        depth, camera=camera, encoding=depth_format.encoding, scale_m=depth_format.scale_m, kind=depth_format.kind,
-        baseline_m=depth_format.baseline_m, max_range_m=depth_format.max_range_m, limits=limits,
-    )  # fmt: skip
+        depth,
+        camera=camera,
+        encoding=depth_format.encoding,
+        scale_m=depth_format.scale_m,
+        kind=depth_format.kind,
+        baseline_m=depth_format.baseline_m,
+        max_range_m=depth_format.max_range_m,
+        limits=limits,
+    )
     require_sizes(colour, depth_m, camera, rgb_size=stored_size(rgb))
     return Query(rgb=colour, depth_m=depth_m, camera=camera, baseline_m=depth_format.baseline_m)

@@ -57,9 +57,15 @@ def look_up(bundle: MapBundle, encoder: Encoder, query: Query, clusters: Cluster
     """
     with timer.stage("fuse"):
         views = query_views(
-            query.rgb, query.depth_m, query.camera, turns=turns_on(bundle.grid),
-            grid=bundle.grid, rows_seen=bundle.rows_seen, down_camera=query.down_camera, given_height=query.camera_height,
-        )  # fmt: skip
+            query.rgb,
+            query.depth_m,
+            query.camera,
+            turns=turns_on(bundle.grid),
+            grid=bundle.grid,
+            rows_seen=bundle.rows_seen,
+            down_camera=query.down_camera,
+            given_height=query.camera_height,
+        )
     with timer.stage("encode"):
         descriptors = encoder.encode(views.planes, side="query")
     with timer.stage("search"):

@@ -39,15 +39,19 @@ Likeness = Callable[[NDArray[np.float64]], NDArray[np.float64]]
 
 
 def starts_from(
-    frames: tuple[Frame, ...], prior: Prior | None, *, lidar_height_m: float, settings: StartSettings,
+    frames: tuple[Frame, ...],
+    prior: Prior | None,
+    *,
+    lidar_height_m: float,
+    settings: StartSettings,
     likeness: Likeness | None = None,
-) -> list[Start]:  # fmt: skip
+) -> list[Start]:
     """Select the most similar distinct poses of the reference's level frame.
 
     Args:
         frames: image pairs, the reference first. A match of another frame gives the pose of the reference at that time.
         prior: prior of the reference pose; None if nothing is known. Half of the starts ignore the prior, because it may be wrong.
-        lidar_height_m: height of the places' LiDAR above the ground.
+        lidar_height_m: height of the places' LiDAR above the ground, m.
         settings: number of starts and their distance.
         likeness: ranks the starts of several frames by their mean similarity; None for one frame. Without it, perceptual aliases of
             single frames could crowd out the right place (decision 0071).
@@ -98,8 +102,13 @@ def _poses(frame: Frame, reference: Frame, lidar_height_m: float) -> Float64[NDA
 
 
 def _distinct(
-    rows: NDArray[np.intp], xy: NDArray[np.float64], heading: NDArray[np.float64], kept: list[int], most: int, settings: StartSettings
-) -> list[int]:  # fmt: skip
+    rows: NDArray[np.intp],
+    xy: NDArray[np.float64],
+    heading: NDArray[np.float64],
+    kept: list[int],
+    most: int,
+    settings: StartSettings,
+) -> list[int]:
     """Add rows in their order to ``kept``, up to ``most``, if they are distinct from all rows before them."""
     kept = list(kept)
     for row in rows:

@@ -138,7 +138,7 @@ class MemoryBudget:
         self._held = 0
         # Finalizers of images may run while this thread holds the lock. So they only append here and never take the lock.
         self._returned: deque[int] = deque()
-        self._told: Callable[[float], None] = lambda _: None
+        self._callback: Callable[[float], None] = lambda _: None
         self._trimmer = Trimmer()
 
     @property
@@ -148,14 +148,14 @@ class MemoryBudget:
             self._take_back()
             return self._held
 
-    def watch(self, told: Callable[[float], None]) -> None:
+    def watch(self, callback: Callable[[float], None]) -> None:
         """Report the reserved bytes now and after every change.
 
         Args:
-            told: called with the number of bytes.
+            callback: called with the number of bytes.
         """
-        self._told = told
-        told(self.held)
+        self._callback = callback
+        callback(self.held)
 
     def hold(self) -> "Hold":
         """Create an empty reservation that can grow."""
@@ -172,7 +172,7 @@ class MemoryBudget:
             if self._held + count > self.limit:
                 return False
             self._held += count
-            self._told(self._held)
+            self._callback(self._held)
             return True
 
     def give_back(self, count: int) -> None:
@@ -184,7 +184,7 @@ class MemoryBudget:
         with self._lock:
             self._take_back()
             self._held -= count
-            self._told(self._held)
+            self._callback(self._held)
         self.freed(count)
 
     def freed(self, count: int) -> None:

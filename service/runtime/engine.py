@@ -239,9 +239,12 @@ class Engine:
         limits = self.settings.limits
         image_limits = ImageLimits(max_bytes=limits.max_part_bytes, max_pixels=limits.max_pixels, reserve=reserve)
         depth_format = DepthFormat(
-            encoding=encoded.depth_encoding, kind=encoded.depth_kind, scale_m=encoded.scale_m, baseline_m=encoded.baseline_m,
+            encoding=encoded.depth_encoding,
+            kind=encoded.depth_kind,
+            scale_m=encoded.scale_m,
+            baseline_m=encoded.baseline_m,
             max_range_m=encoded.max_range_m,
-        )  # fmt: skip
+        )
         return replace(
             decoded_query(encoded.rgb, encoded.depth, encoded.camera, depth_format, grid=grid, limits=image_limits),
             down_camera=encoded.down_camera,
@@ -296,7 +299,8 @@ def prior_in(encoded: EncodedQuery, bundle: MapBundle) -> Prior | None:
     earth = bundle.earth
     if earth is None:
         raise RequestError(
-            f"prior.wgs84: the map {bundle.name!r} is not georeferenced; send prior.position in the map frame", field="prior.wgs84"
-        )  # fmt: skip
+            f"prior.wgs84: the map {bundle.name!r} is not georeferenced; send prior.position in the map frame",
+            field="prior.wgs84",
+        )
     latitude_deg, longitude_deg = encoded.prior_wgs84
     return replace(encoded.prior, position_m=earth.to_map(latitude_deg, longitude_deg, earth.height_m)[:2])

@@ -61,9 +61,9 @@ def require_known(environment: Mapping[str, str], settings: type[BaseModel]) -> 
             field=links[0],
         )
     if unknown:
-        told = ", ".join(f"{name}{did_you_mean(name.upper(), known)}" for name in unknown)
+        listed = ", ".join(f"{name}{did_you_mean(name.upper(), known)}" for name in unknown)
         raise RequestError(
-            f"unknown setting: {told}; docs/serving.md lists the settings. Variables of other programs may begin "
+            f"unknown setting: {listed}; docs/serving.md lists the settings. Variables of other programs may begin "
             f"with {CLIENT_PREFIX}",
             field=unknown[0],
         )

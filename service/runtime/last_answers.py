@@ -69,14 +69,19 @@ class LastAnswers:
         has_street = localized and bundle.streets is not None and answer.street >= 0
         self._kept.append(
             LastAnswer(
-                number=next(self._numbers), at=datetime.now(UTC), map_name=bundle.name, map_version=bundle.manifest.version,
-                status=answer.status, confidence=answer.confidence,
+                number=next(self._numbers),
+                at=datetime.now(UTC),
+                map_name=bundle.name,
+                map_version=bundle.manifest.version,
+                status=answer.status,
+                confidence=answer.confidence,
                 street=bundle.streets[answer.street].name if has_street and bundle.streets is not None else None,
                 position_m=T_map_camera[:3, 3].copy() if localized else None,
-                heading_rad=heading_of_camera(T_map_camera) if localized else None, frames=frames,
+                heading_rad=heading_of_camera(T_map_camera) if localized else None,
+                frames=frames,
                 total_ms=answer.timings.total_ms,
             )
-        )  # fmt: skip
+        )
 
     def newest(self, most: int) -> list[LastAnswer]:
         """Return the newest answers, the newest one first.

@@ -24,14 +24,16 @@ class JsonFormatter(logging.Formatter):
         Args:
             record: the event.
         """
-        told: dict[str, object] = {
+        entry: dict[str, object] = {
             "time": datetime.fromtimestamp(record.created, UTC).isoformat(timespec="milliseconds"),
-            "level": record.levelname.lower(), "logger": record.name, "event": record.getMessage(),
-        }  # fmt: skip
-        told |= getattr(record, "figures", {})
+            "level": record.levelname.lower(),
+            "logger": record.name,
+            "event": record.getMessage(),
+        }
+        entry |= getattr(record, "figures", {})
         if record.exc_info:
-            told["error"] = self.formatException(record.exc_info)
-        return json.dumps(told, default=str)
+            entry["error"] = self.formatException(record.exc_info)
+        return json.dumps(entry, default=str)
 
 
 class TextFormatter(logging.Formatter):
@@ -77,8 +79,12 @@ def log_request(*, face: str, method: str, code: str, seconds: float, request_id
     if not _log.isEnabledFor(logging.INFO):
         return
     figures: dict[str, object] = {
-        "face": face, "method": method, "code": code, "ms": round(1e3 * seconds, 1), "request_id": request_id,
-    }  # fmt: skip
+        "face": face,
+        "method": method,
+        "code": code,
+        "ms": round(1e3 * seconds, 1),
+        "request_id": request_id,
+    }
     if (trace_id := trace_id_of(traceparent)) is not None:
         figures["trace_id"] = trace_id
     _log.info("request", extra={"figures": figures})

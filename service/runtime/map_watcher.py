@@ -53,7 +53,7 @@ class MapWatcher:
         self._registry = registry
         self._paths = tuple(paths)
         self._warm = warm
-        self._stop, self._told = threading.Event(), Wakeup()
+        self._stop, self._wakeup = threading.Event(), Wakeup()
         self._thread: threading.Thread | None = None
         self._manifests: dict[Path, tuple[Stamp, Manifest]] = {}
         self._failed: dict[Path, tuple[Stamp, StreetfixError]] = {}
@@ -108,11 +108,11 @@ class MapWatcher:
         bundles = self._bundles()
         if drop_missing:
             self._due = self._missing()
-        told = self._mount_new(bundles)
+        events = self._mount_new(bundles)
         if dropped := self._drop():
-            told += dropped + self._mount_new(bundles)  # older versions may fit now
+            events += dropped + self._mount_new(bundles)  # older versions may fit now
         self._tell_refused()
-        return told
+        return events
 
     def start(self, interval_s: float) -> None:
         """Start a thread that scans the folders.
@@ -125,12 +125,12 @@ class MapWatcher:
 
     def look_now(self) -> None:
         """Request a scan that also unmounts missing versions. Safe to call from a signal handler."""
-        self._told.set()
+        self._wakeup.set()
 
     def stop(self) -> None:
         """End the thread."""
         self._stop.set()
-        self._told.set()
+        self._wakeup.set()
         if self._thread is not None:
             self._thread.join(timeout=5.0)  # the service must not wait for a map that is being opened
 
@@ -140,18 +140,18 @@ class MapWatcher:
         next_look, seen = time.monotonic() + (0.0 if table.is_shared else interval_s), table.read()
         while True:
             patience_s = min(max(0.0, next_look - time.monotonic()), threading.TIMEOUT_MAX)
-            told = self._told.wait(min(patience_s, _POLL_S) if table.is_shared else patience_s)
+            signalled = self._wakeup.wait(min(patience_s, _POLL_S) if table.is_shared else patience_s)
             if self._stop.is_set():
                 return
-            if told:
-                self._told.clear()
+            if signalled:
+                self._wakeup.clear()
             try:
                 if time.monotonic() >= next_look:
                     self._forget_failures_of(table.others_offer())
                 before, seen = seen, table.read()
                 is_news = seen is not before and bool(self._due or table.others_offer())
-                if told or is_news or time.monotonic() >= next_look:
-                    self.scan(drop_missing=told)
+                if signalled or is_news or time.monotonic() >= next_look:
+                    self.scan(drop_missing=signalled)
                     next_look = time.monotonic() + interval_s
                 if table.is_shared and any(seen.offers.values()):
                     table.settle()  # a worker that the others wait for may have ended
@@ -170,19 +170,19 @@ class MapWatcher:
                 del self._failed[path]
 
     def _mount_new(self, bundles: Iterable[_Bundle]) -> list[str]:
-        told = []
+        events = []
         for each in sorted(bundles, key=lambda bundle: bundle.version.made_at, reverse=True):
             if self._is_refused(each.path, each.stamp) or not self._registry.wants(each.version):
                 continue
             name, version = each.version.key
             if (error := self._mount(each)) is None:
-                told.append(f"mounted {name} {version}")
+                events.append(f"mounted {name} {version}")
                 # At the start the command line prints the serving maps. Later only the log reports them.
                 level = logging.INFO if self._thread is None else logging.WARNING
                 _log.log(level, "map_mounted name=%s version=%s", name, version)
             else:
-                told.append(f"{each.path} is not mounted: {error}")
-        return told
+                events.append(f"{each.path} is not mounted: {error}")
+        return events
 
     def _mount(self, bundle: _Bundle) -> StreetfixError | None:
         """Open, warm up and mount a bundle; return the error if that fails."""
@@ -253,9 +253,14 @@ class MapWatcher:
         unread = [path for path, (_, error) in self._failed.items() if _is_unreadable(error)]
         open_here = [v.bundle for each in self._registry for v in self._registry.versions(each.bundle.name)]
         return {
-            manifest_key(bundle.manifest) for bundle in open_here
-            if not (bundle.path in present or manifest_key(bundle.manifest) in held or any(map(bundle.path.is_relative_to, unread)))
-        }  # fmt: skip
+            manifest_key(bundle.manifest)
+            for bundle in open_here
+            if not (
+                bundle.path in present
+                or manifest_key(bundle.manifest) in held
+                or any(map(bundle.path.is_relative_to, unread))
+            )
+        }
 
     def _drop(self) -> list[str]:
         """Unmount the due versions that are still missing.

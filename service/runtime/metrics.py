@@ -63,9 +63,12 @@ class Metrics:
             registry=self._registry,
         )
         self._request_seconds = Histogram(
-            "streetfix_request_seconds", "From a request's first byte to its answer.", ["face", "method"], buckets=_SECONDS,
+            "streetfix_request_seconds",
+            "From a request's first byte to its answer.",
+            ["face", "method"],
+            buckets=_SECONDS,
             registry=self._registry,
-        )  # fmt: skip
+        )
         self._stage_seconds = Histogram(
             "streetfix_stage_seconds", "Stages of an answer.", ["stage"], buckets=_SECONDS, registry=self._registry
         )

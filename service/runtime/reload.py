@@ -90,12 +90,12 @@ class Reloader:
 
     def _run(self, every_s: float | None) -> None:
         while True:
-            told = self._wake.wait(every_s)
+            signalled = self._wake.wait(every_s)
             if self._stopping:
                 return
-            if told:  # a signal after the timeout of the wait belongs to the next check
+            if signalled:  # a signal after the timeout of the wait belongs to the next check
                 self._wake.clear()
-            self.look(everything=told)
+            self.look(everything=signalled)
 
 
 def _signature(paths: Sequence[Path]) -> Signature:

@@ -38,9 +38,11 @@ class Limits(BaseModel):
     # gRPC stores the length of a message in 32 bits.
     max_request_bytes: int = Field(40 * 2**20, ge=1024, le=2**31 - 1, description="whole body of a request")
     max_message_bytes: int = Field(
-        16 * 2**20, ge=1024, le=2**31 - 1,
+        16 * 2**20,
+        ge=1024,
+        le=2**31 - 1,
         description="one gRPC message, no more than max_request_bytes; memory is kept for this size while a message is read",
-    )  # fmt: skip
+    )
     max_part_bytes: int = Field(DEFAULT_LIMITS.max_bytes, ge=1024, le=2**31 - 1, description="one image, encoded")
     max_pixels: int = Field(DEFAULT_LIMITS.max_pixels, ge=1, le=2**30, description="one image, decoded")
 
@@ -141,9 +143,11 @@ class Settings(BaseSettings):
         30.0, gt=0, le=86400, description="seconds from a request's first byte to its answer"
     )
     false_accept_rate: float = Field(
-        FALSE_ACCEPT_RATE, ge=LEAST_FALSE_ACCEPT_RATE, lt=1,
+        FALSE_ACCEPT_RATE,
+        ge=LEAST_FALSE_ACCEPT_RATE,
+        lt=1,
         description="largest share of out-of-map queries with status LOCALIZED",
-    )  # fmt: skip
+    )
     console: bool = Field(True, description="serve the browser console at /console, and its endpoints")
     samples: Path | None = Field(
         None,

@@ -73,8 +73,9 @@ class Stream:
         elif encoded.map_name not in (None, self._name, self._localizer.bundle.name):
             raise RequestError(
                 f"map: this stream uses {self._localizer.bundle.name!r} since its first frame, not {encoded.map_name!r}; "
-                "open another stream for another map", field="map",
-            )  # fmt: skip
+                "open another stream for another map",
+                field="map",
+            )
         self._localizer = self._engine.registry.get(self._name)
         if self._name is None:  # it is the only map now, but others may be mounted later
             self._name = self._localizer.bundle.name

@@ -66,15 +66,21 @@ def measure(
     for frame in frames:
         blocks = blocks_of(frame.query.depth_m, frame.query.camera, settings, noise=frame.noise)
         points = points_from(
-            blocks, frame.R_level_camera, frame.views.height_m, settings, noise=frame.noise,
+            blocks,
+            frame.R_level_camera,
+            frame.views.height_m,
+            settings,
+            noise=frame.noise,
             focal_baseline_px_m=focal_baseline_px_m,
-        )  # fmt: skip
+        )
         T_reference_level = frame.T_reference_level(frames[0])
         picture = picture_of(
-            blocks, T_reference_level @ transform_from(frame.R_level_camera, np.zeros(3)), noise=frame.noise,
+            blocks,
+            T_reference_level @ transform_from(frame.R_level_camera, np.zeros(3)),
+            noise=frame.noise,
             focal_baseline_px_m=focal_baseline_px_m if is_rig else None,
             movable=movable_of(blocks, frame.R_level_camera, frame.views.height_m, settings),
-        )  # fmt: skip
+        )
         measured.append(MeasuredFrame(frame, frame is frames[0], T_reference_level, blocks, points, picture))
     return tuple(measured)
 

@@ -17,7 +17,7 @@ from jaxtyping import Float32, Int32, UInt8
 from numpy.typing import NDArray
 
 from service.geometry.camera import PinholeCamera
-from service.registration.rays import met_by
+from service.registration.rays import cast_rays
 from service.registration.register import Registered
 from service.registration.visibility import SurfelRaycaster
 from service.scoring.measured import MeasuredFrame
@@ -44,8 +44,11 @@ class PhotometrySettings:
 
 
 def grey_of(
-    rgb: UInt8[NDArray[np.uint8], "h w 3"], camera: PinholeCamera, covered: tuple[float, float], settings: PhotometrySettings
-) -> Float32[NDArray[np.float32], "H W"]:  # fmt: skip
+    rgb: UInt8[NDArray[np.uint8], "h w 3"],
+    camera: PinholeCamera,
+    covered: tuple[float, float],
+    settings: PhotometrySettings,
+) -> Float32[NDArray[np.float32], "H W"]:
     """Compute the logarithm of an image's grey levels at the resolution of a small camera (area means).
 
     Args:
@@ -62,31 +65,35 @@ def grey_of(
 
 
 def agreement_of_brightness(
-    brightness: Float32[NDArray[np.float32], " n"], met: Int32[NDArray[np.int32], "H W"], grey: Float32[NDArray[np.float32], "H W"],
+    brightness: Float32[NDArray[np.float32], " n"],
+    surfel_of: Int32[NDArray[np.int32], "H W"],
+    grey: Float32[NDArray[np.float32], "H W"],
     settings: PhotometrySettings,
-) -> float:  # fmt: skip
+) -> float:
     """Correlate the map's brightness with an image: mean squared correlation of all patches, from 0 to 1.
 
     The score is 0 where no visible surfel has a brightness.
 
     Args:
         brightness: LiDAR intensity of each surfel, NaN where unknown.
-        met: index of the surfel in each pixel of the small image, -1 for none, as ``SurfelRaycaster.meet`` returns it.
+        surfel_of: index of the surfel in each pixel of the small image, -1 for none, as ``SurfelRaycaster.intersect`` returns it.
         grey: logarithmic grey levels, as ``grey_of`` returns them.
         settings: of the score.
     """
-    return squared_correlation(_drawn(brightness, met, settings), grey, settings)
+    return squared_correlation(_rendered(brightness, surfel_of, settings), grey, settings)
 
 
-def _drawn(
-    brightness: Float32[NDArray[np.float32], " n"], met: Int32[NDArray[np.int32], "H W"], settings: PhotometrySettings
+def _rendered(
+    brightness: Float32[NDArray[np.float32], " n"],
+    surfel_of: Int32[NDArray[np.int32], "H W"],
+    settings: PhotometrySettings,
 ) -> Float32[NDArray[np.float32], "H W"]:
     """Logarithm of the brightness of each pixel's surfel, relative to the mean; NaN where unknown."""
-    values = np.where(met >= 0, brightness[np.maximum(met, 0)], np.float32(np.nan))
+    values = np.where(surfel_of >= 0, brightness[np.maximum(surfel_of, 0)], np.float32(np.nan))
     known = values[~np.isnan(values)]
     mean = float(known.mean()) if known.size else 0.0
     if not mean > 0:
-        return np.full(met.shape, np.nan, np.float32)
+        return np.full(surfel_of.shape, np.nan, np.float32)
     logarithm: Float32[NDArray[np.float32], "H W"] = np.log(values / np.float32(mean) + np.float32(settings.dark_share))
     return logarithm
 
@@ -128,7 +135,7 @@ class BrightnessScorer:
     """Scorer by the agreement of a query's images with the brightness of the map.
 
     Args:
-        sights: ray casting into the map cloud.
+        raycaster: ray casting into the map cloud.
         measured: frames of the query, the reference first.
         settings: of the score.
     """
@@ -136,15 +143,15 @@ class BrightnessScorer:
     name = "brightness"
 
     def __init__(
-        self, sights: SurfelRaycaster, measured: tuple[MeasuredFrame, ...], settings: PhotometrySettings
+        self, raycaster: SurfelRaycaster, measured: tuple[MeasuredFrame, ...], settings: PhotometrySettings
     ) -> None:
-        self._sights, self._measured, self._settings = sights, measured, settings
+        self._raycaster, self._measured, self._settings = raycaster, measured, settings
         self._greys: list[Float32[NDArray[np.float32], "H W"]] | None = None
 
     @property
     def is_known(self) -> bool:
         """Whether the map has brightness."""
-        return self._sights.cloud.brightness is not None
+        return self._raycaster.cloud.brightness is not None
 
     def score(self, poses: tuple[Registered, ...]) -> Scores:
         """Return the mean squared correlation over all frames, 0 to 1; 0 if the map has no brightness.
@@ -152,7 +159,7 @@ class BrightnessScorer:
         Args:
             poses: registered poses of the reference's level frame.
         """
-        brightness = self._sights.cloud.brightness
+        brightness = self._raycaster.cloud.brightness
         if brightness is None:
             return Scores(np.zeros(len(poses)))
         if self._greys is None:  # many queries need no brightness, so the images are reduced at the first score
@@ -163,8 +170,11 @@ class BrightnessScorer:
         return Scores(np.array([self._mean(brightness, self._greys, pose) for pose in poses]))
 
     def _mean(
-        self, brightness: Float32[NDArray[np.float32], " n"], greys: list[Float32[NDArray[np.float32], "H W"]], pose: Registered
-    ) -> float:  # fmt: skip
-        met = met_by(self._sights, [each.picture for each in self._measured], pose)
-        pairs = zip(met, greys, strict=True)
+        self,
+        brightness: Float32[NDArray[np.float32], " n"],
+        greys: list[Float32[NDArray[np.float32], "H W"]],
+        pose: Registered,
+    ) -> float:
+        surfel_of = cast_rays(self._raycaster, [each.picture for each in self._measured], pose)
+        pairs = zip(surfel_of, greys, strict=True)
         return float(np.mean([agreement_of_brightness(brightness, own, grey, self._settings) for own, grey in pairs]))

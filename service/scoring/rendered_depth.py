@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from service.geometry.camera import PinholeCamera
 from service.geometry.rigid import Rotation, transform_from
-from service.registration.kernel import BeamModel, QueryPoints, agree, render
+from service.registration.kernel import BeamModel, QueryPoints, consistency, render
 from service.registration.register import Registered
 from service.registration.surfel_map import TILE_M, SurfelMap
 from service.scoring.measured import MeasuredFrame
@@ -26,7 +26,15 @@ SURFEL_M = 0.4
 REACH_M = 45.0
 #: Thrun, Burgard and Fox, Probabilistic Robotics, 2005, section 6.3. Chosen on the validation cities.
 _BEAM = BeamModel(
-    hit=0.6, new=0.25, gone=0.02, any=0.05, rough_m=0.15, span_m=40.0, certain=3.0, margin_m=0.25, nothing_m=60.0
+    hit=0.6,
+    new=0.25,
+    removed=0.02,
+    outlier=0.05,
+    roughness_m=0.15,
+    span_m=40.0,
+    threshold_sigmas=3.0,
+    margin_m=0.25,
+    unmapped_m=60.0,
 )
 
 
@@ -98,20 +106,33 @@ def project_points(points: QueryPoints, camera: PinholeCamera, R_level_camera: R
     return ProjectedPoints(small, R_level_camera, pixel, z.astype(np.float64), sigma, points.q)
 
 
-def agreement(cloud: SurfelMap, seen: ProjectedPoints, candidate: Registered) -> Agreement:
+def agreement(cloud: SurfelMap, projected: ProjectedPoints, candidate: Registered) -> Agreement:
     """Render the map at a candidate's pose and compare the query's depth with it.
 
     Args:
         cloud: surfel map.
-        seen: projected points of the query.
+        projected: projected points of the query.
         candidate: the registered pose, map frame.
     """
-    T = transform_from(candidate.R_map_level @ seen.R_level_camera, candidate.camera_m - cloud.origin_m)
-    drawn = render(
-        cloud.surfels, cloud.tiles, tile_m=TILE_M, T_map_camera=T, camera=seen.camera, size_m=SURFEL_M, reach_m=REACH_M
+    T = transform_from(candidate.R_map_level @ projected.R_level_camera, candidate.camera_m - cloud.origin_m)
+    rendered = render(
+        cloud.surfels,
+        cloud.tiles,
+        tile_m=TILE_M,
+        T_map_camera=T,
+        camera=projected.camera,
+        size_m=SURFEL_M,
+        reach_m=REACH_M,
     )
-    likelihood, through, front, unmapped = agree(
-        drawn, seen.pixel, seen.z, seen.sigma, seen.q, _BEAM, scale=candidate.scale, offset=candidate.offset
+    likelihood, through, front, unmapped = consistency(
+        rendered,
+        projected.pixel,
+        projected.z,
+        projected.sigma,
+        projected.q,
+        _BEAM,
+        scale=candidate.scale,
+        offset=candidate.offset,
     )
     return Agreement(likelihood, through, front, unmapped)
 
@@ -128,7 +149,7 @@ class RenderedDepthScorer:
 
     def __init__(self, cloud: SurfelMap, measured: tuple[MeasuredFrame, ...]) -> None:
         self._cloud, self._measured = cloud, [each for each in measured if len(each.points)]
-        self._seen = [
+        self._projected = [
             project_points(each.points, each.frame.query.camera, each.frame.R_level_camera) for each in self._measured
         ]
 
@@ -144,5 +165,5 @@ class RenderedDepthScorer:
 
     def _agreement(self, pose: Registered) -> Agreement:
         """Mean over all frames that have points."""
-        pairs = zip(self._measured, self._seen, strict=True)
-        return Agreement.mean([agreement(self._cloud, seen, each.pose(pose)) for each, seen in pairs])
+        pairs = zip(self._measured, self._projected, strict=True)
+        return Agreement.mean([agreement(self._cloud, projected, each.pose(pose)) for each, projected in pairs])

@@ -77,7 +77,7 @@ def similarities_at(
         bundle: the map.
         descriptors: descriptors of the query views, one row per turn; the most similar turn counts.
         R_map_level: rotation of the query's level frame to the map frame, per pose.
-        camera_m: position of the camera, map frame, per pose.
+        camera_m: position of the camera of each pose, map frame, m.
 
     Returns:
         Per pose the weighted mean similarity, and the weighted mean distance of the places in metres. Similarity falls with distance.

@@ -33,7 +33,7 @@ class SupportWeights:
         likelihood: weight of the mean log likelihood of the rendered depth.
         prior: weight of the log weight of the prior, which is in nats already.
         brightness: weight of the agreement with the map's brightness.
-        behind: support gap to the best candidate, in nats, up to which brightness is computed, because rendering takes time.
+        brightness_gap: largest support gap to the best candidate at which brightness is computed, nats. Rendering takes time.
     """
 
     inliers: float = 20.0
@@ -41,7 +41,7 @@ class SupportWeights:
     likelihood: float = 2.4
     prior: float = 1.0
     brightness: float = 80.0
-    behind: float = 4.0
+    brightness_gap: float = 4.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -52,12 +52,12 @@ class LocalScoreWeights:
     descriptor similarity does not tell them apart. Brightness tells more here than between two streets.
 
     Attributes:
-        still: weight of the share of inliers among points of static objects.
+        static_inliers: weight of the share of inliers among points of static objects.
         brightness: weight of the agreement with the map's brightness.
         stay: bonus of the original pose, nats.
     """
 
-    still: float = 45.0
+    static_inliers: float = 45.0
     brightness: float = 300.0
     stay: float = 1.0
 
@@ -67,8 +67,12 @@ Weighted = tuple[Scorer, float]
 
 
 def scorers_of(
-    bundle: MapBundle, cloud: SurfelMap, measured: tuple[MeasuredFrame, ...], prior: Prior | None, weights: SupportWeights
-) -> tuple[Weighted, ...]:  # fmt: skip
+    bundle: MapBundle,
+    cloud: SurfelMap,
+    measured: tuple[MeasuredFrame, ...],
+    prior: Prior | None,
+    weights: SupportWeights,
+) -> tuple[Weighted, ...]:
     """Return the scorers that rate every candidate of a query, each with its weight. A new scorer is one more line.
 
     Brightness is not among them: ``PoseScorer.with_brightness`` adds it for the leading candidates only.
@@ -134,19 +138,21 @@ class PoseScorer:
         Args:
             candidates: candidates without brightness, the best supported first.
         """
-        leading = [each for each in candidates if each.support >= candidates[0].support - self.weights.behind]
+        leading = [each for each in candidates if each.support >= candidates[0].support - self.weights.brightness_gap]
         if not self.brightness.is_known or len(leading) == 1:
             return candidates
         scores = self.brightness.score(tuple(each.registered for each in leading)).values.tolist()
-        told = [
+        rescored = [
             replace(
-                each, support=each.support + self.weights.brightness * score, scores={**each.scores, self.brightness.name: score}
+                each,
+                support=each.support + self.weights.brightness * score,
+                scores={**each.scores, self.brightness.name: score},
             )
             for each, score in zip(leading, scores, strict=True)
-        ]  # fmt: skip
+        ]
         least = self.weights.brightness * min(scores)
-        told += [replace(each, support=each.support + least) for each in candidates[len(leading) :]]
-        return sorted(told, key=lambda candidate: -candidate.support)
+        rescored += [replace(each, support=each.support + least) for each in candidates[len(leading) :]]
+        return sorted(rescored, key=lambda candidate: -candidate.support)
 
     def select_local_optimum(self, best: Candidate, near: list[LocalPose]) -> Candidate:
         """Choose the best of several poses near a candidate.
@@ -161,12 +167,12 @@ class PoseScorer:
         known = [best.scores[name]] if name in best.scores else []
         poses = (best.registered, *(each.pose for each in near[1:]))[len(known) :]
         brightness = [*known, *self.brightness.score(poses).values.tolist()]
-        told = [
-            self.near.still * each.still + self.near.brightness * score
+        totals = [
+            self.near.static_inliers * each.static_inliers + self.near.brightness * score
             for each, score in zip(near, brightness, strict=True)
         ]
-        told[0] += self.near.stay
-        chosen = int(np.argmax(told))
+        totals[0] += self.near.stay
+        chosen = int(np.argmax(totals))
         if chosen == 0:
             return best
         (moved,) = self.candidates((near[chosen].pose,))

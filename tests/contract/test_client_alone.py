@@ -141,9 +141,13 @@ def test_the_command_line_without_its_packages_prints_one_line() -> None:
 def test_the_server_and_everything_that_needs_it_bring_the_rest() -> None:
     extras = PROJECT["optional-dependencies"]
     with_server = {"server"}
-    while more := {
-        name for name, needs in extras.items()
-        if any(set(Requirement(each).extras) & with_server for each in needs if each.startswith("streetfix["))
-    } - with_server:  # fmt: skip
+    while (
+        more := {
+            name
+            for name, needs in extras.items()
+            if any(set(Requirement(each).extras) & with_server for each in needs if each.startswith("streetfix["))
+        }
+        - with_server
+    ):
         with_server |= more
     assert set(extras) - with_server == {"grpc", "lz4"}

@@ -30,8 +30,14 @@ def written(folder: Path, text: str = HEAD, name: str = "0007-is-it-so.md") -> P
 
 def test_a_head_is_read_field_by_field(tmp_path: Path) -> None:
     assert read_decision(written(tmp_path)) == Decision(
-        "0007-is-it-so.md", "0007", "Is it so?", "2026-11-25", "in use", "retrieval", "Yes: 0.9 instead of 0.8 of 26 queries."
-    )  # fmt: skip
+        "0007-is-it-so.md",
+        "0007",
+        "Is it so?",
+        "2026-11-25",
+        "in use",
+        "retrieval",
+        "Yes: 0.9 instead of 0.8 of 26 queries.",
+    )
 
 
 @pytest.mark.parametrize(

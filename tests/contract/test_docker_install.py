@@ -36,9 +36,15 @@ def run(command: list[str], cwd: Path, **environment: str) -> "subprocess.Comple
     """Run without anything of the environment that the tests run in."""
     kept = {"HOME": str(cwd.parent), "PATH": "/usr/bin:/bin", "PYTHONDONTWRITEBYTECODE": "1"}
     return subprocess.run(
-        command, cwd=cwd, env=kept | environment, stdin=subprocess.DEVNULL, capture_output=True, text=True, check=False,
+        command,
+        cwd=cwd,
+        env=kept | environment,
+        stdin=subprocess.DEVNULL,
+        capture_output=True,
+        text=True,
+        check=False,
         timeout=300,
-    )  # fmt: skip
+    )
 
 
 @pytest.fixture(scope="module")
@@ -140,7 +146,7 @@ def test_commands_that_are_not_there_are_not_listed(installed: Path, tmp_path: P
         (["train", "--run", "run"], "training"),
         (["export", "run", "--out", "encoder.onnx"], "training"),
     ],
-)  # fmt: skip
+)
 def test_a_command_that_is_not_there_says_what_to_install(
     installed: Path, tmp_path: Path, arguments: list[str], extra: str
 ) -> None:
@@ -157,10 +163,17 @@ def port(installed: Path, bundle_path: Path, tmp_path: Path) -> Iterator[str]:
     """Where the service tells its health; it is started as the image starts it but on loopback."""
     process = subprocess.Popen(
         [installed / "bin" / "streetfix", "serve", "--host", "127.0.0.1"],
-        cwd=tmp_path, env={"PATH": "/usr/bin:/bin", "STREETFIX_MAPS": str(bundle_path), "STREETFIX_PORT": "0",
-                           "STREETFIX_HEALTH_PORT": "0"},
-        stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, text=True,
-    )  # fmt: skip
+        cwd=tmp_path,
+        env={
+            "PATH": "/usr/bin:/bin",
+            "STREETFIX_MAPS": str(bundle_path),
+            "STREETFIX_PORT": "0",
+            "STREETFIX_HEALTH_PORT": "0",
+        },
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.PIPE,
+        text=True,
+    )
     try:
         lines = iter(process.stdout or ())
         health = next(found[1] for line in lines if (found := re.search(r"health at http://127.0.0.1:(\d+)", line)))

@@ -16,9 +16,14 @@ from service.runtime.settings import Settings
 ROOT = Path(__file__).parents[2]
 #: All texts that may tell such a figure beside the documents; the decision log and the changelog tell what was.
 OTHERS = [
-    ROOT / "openapi" / "openapi.json", *sorted((ROOT / "proto").rglob("*.proto")),
-    *(path for path in sorted((ROOT / "deploy").rglob("*")) if path.suffix in (".yaml", ".yml", ".md", ".txt", ".toml")),
-]  # fmt: skip
+    ROOT / "openapi" / "openapi.json",
+    *sorted((ROOT / "proto").rglob("*.proto")),
+    *(
+        path
+        for path in sorted((ROOT / "deploy").rglob("*"))
+        if path.suffix in (".yaml", ".yml", ".md", ".txt", ".toml")
+    ),
+]
 PAGES = documents()
 NUMBER = r"(?:\d[\d.,]*|two|three|four|five|six|ten)"
 #: What a document must not type: how fast the service is, and how often it errs by default.
@@ -66,10 +71,15 @@ def test_a_default_false_accept_rate_is_the_codes(page: Path) -> None:
 def test_what_is_typed_is_found() -> None:
     """Texts that once stood in the documents."""
     for text in (
-        "no more than three in a hundred queries taken outside the map", "The default lets 2 in 100 strangers through", "2 % by default",
-        "One core answers about 29 full requests a second", "25 requests per second", "36 a second with two threads",
-        "an answer is about as likely right as not", "is right in one of six cases",
-    ):  # fmt: skip
+        "no more than three in a hundred queries taken outside the map",
+        "The default lets 2 in 100 strangers through",
+        "2 % by default",
+        "One core answers about 29 full requests a second",
+        "25 requests per second",
+        "36 a second with two threads",
+        "an answer is about as likely right as not",
+        "is right in one of six cases",
+    ):
         assert any(re.search(pattern, text) for pattern in TYPED.values()), text
 
 

@@ -75,8 +75,10 @@ def test_prometheus_shows_a_key_where_the_service_wants_one() -> None:
 def test_probes_ask_the_port_that_asks_for_no_certificate() -> None:
     pod = (CHART / "templates" / "deployment.yaml").read_text()
     assert re.findall(r"httpGet: \{ path: ([^,]+), port: (\w+) \}", pod) == [
-        ("/readyz", "health"), ("/readyz", "health"), ("/livez", "health"),
-    ]  # fmt: skip
+        ("/readyz", "health"),
+        ("/readyz", "health"),
+        ("/livez", "health"),
+    ]
     assert "STREETFIX_HEALTH_PORT" in pod
 
 
@@ -155,9 +157,13 @@ def test_with_client_certificates_everything_that_has_none_uses_the_health_port(
 @needs_helm
 def test_pods_are_placed_and_named_as_the_values_say() -> None:
     found = documents(
-        *BASE, *KEYS, "--set", "image.pullSecrets[0].name=registry,nodeSelector.disk=fast,tolerations[0].key=gpu,serviceAccount.name=me",
-        "--set", "podAnnotations.team=maps,affinity.nodeAffinity.x=y",
-    )  # fmt: skip
+        *BASE,
+        *KEYS,
+        "--set",
+        "image.pullSecrets[0].name=registry,nodeSelector.disk=fast,tolerations[0].key=gpu,serviceAccount.name=me",
+        "--set",
+        "podAnnotations.team=maps,affinity.nodeAffinity.x=y",
+    )
     pod = found["Deployment"]["spec"]["template"]
     assert pod["spec"]["imagePullSecrets"] == [{"name": "registry"}]
     assert pod["spec"]["nodeSelector"] == {"disk": "fast"}

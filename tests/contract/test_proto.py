@@ -27,9 +27,12 @@ def test_the_proto_is_lint_clean(tmp_path: Path) -> None:
 
 def test_the_proto_is_formatted(tmp_path: Path) -> None:
     done = subprocess.run(
-        [BUF, "format", "--diff"], cwd=PROTO, env={"BUF_CACHE_DIR": str(tmp_path), "PATH": ""}, capture_output=True,
+        [BUF, "format", "--diff"],
+        cwd=PROTO,
+        env={"BUF_CACHE_DIR": str(tmp_path), "PATH": ""},
+        capture_output=True,
         check=False,
-    )  # fmt: skip
+    )
     assert (done.returncode, done.stdout) == (0, b"")
 
 
@@ -66,10 +69,21 @@ def test_the_request_has_the_fields_of_the_rest_contract() -> None:
 def test_the_generated_code_is_that_of_the_proto(tmp_path: Path) -> None:
     folder = "service/grpc/generated"
     done = subprocess.run(
-        [sys.executable, "-m", "grpc_tools.protoc", "-I", f"{folder}={PROTO}", f"--python_out={tmp_path}", f"--pyi_out={tmp_path}",
-         f"--grpc_python_out={tmp_path}", f"{folder}/streetfix/v1/localization.proto"],
-        capture_output=True, text=True, check=False,
-    )  # fmt: skip
+        [
+            sys.executable,
+            "-m",
+            "grpc_tools.protoc",
+            "-I",
+            f"{folder}={PROTO}",
+            f"--python_out={tmp_path}",
+            f"--pyi_out={tmp_path}",
+            f"--grpc_python_out={tmp_path}",
+            f"{folder}/streetfix/v1/localization.proto",
+        ],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
     assert done.returncode == 0, done.stderr
     made = sorted((tmp_path / folder / "streetfix" / "v1").iterdir())
     assert len(made) == 3

@@ -48,8 +48,11 @@ def test_every_frame_comes_back_as_a_pose_from_a_service(url: str, pictures_of: 
 def test_a_signal_ends_it_cleanly(bundle_path: Path, number: signal.Signals) -> None:
     process = subprocess.Popen(
         [*COMMAND, "--map", str(bundle_path), "--domain", str(20 + os.getpid() % 200)],
-        env=os.environ | {"CYCLONEDDS_URI": LOOPBACK}, stdout=subprocess.PIPE, text=True, bufsize=1,
-    )  # fmt: skip
+        env=os.environ | {"CYCLONEDDS_URI": LOOPBACK},
+        stdout=subprocess.PIPE,
+        text=True,
+        bufsize=1,
+    )
     assert process.stdout is not None
     assert re.match(r"listening to /camera/color/image_raw .*Ctrl-C", process.stdout.readline())
     process.send_signal(number)
@@ -66,8 +69,12 @@ def test_a_map_that_is_none_is_told_at_once(tmp_path: Path) -> None:
 
 def test_a_dds_that_does_not_start_is_told(bundle_path: Path) -> None:
     done = subprocess.run(
-        [*COMMAND, "--map", str(bundle_path)], env=os.environ | {"CYCLONEDDS_URI": "<CycloneDDS><Domain><Nonsense/>"},
-        capture_output=True, text=True, check=False, timeout=60,
-    )  # fmt: skip
+        [*COMMAND, "--map", str(bundle_path)],
+        env=os.environ | {"CYCLONEDDS_URI": "<CycloneDDS><Domain><Nonsense/>"},
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=60,
+    )
     assert done.returncode == 1
     assert "check --domain and the environment's CYCLONEDDS_URI" in done.stderr

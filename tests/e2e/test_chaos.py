@@ -9,8 +9,8 @@ from benchmarks.chaos.disk import small_disk
 from benchmarks.chaos.run import Chaos
 from benchmarks.serving.bodies import multipart
 from model_training.loadtest.payloads import Payload
-from service.client.asking import Asked
 from service.client.grpc_messages import request_message
+from service.client.prepare import PreparedRequest
 from service.contract import schema
 
 #: With this seed the steps have most kinds of action, and no restart of the whole service, which takes seconds.
@@ -19,7 +19,7 @@ SEED, STEPS, WORKERS = 3, 20, 2
 
 def payload_of(parts: dict[str, bytes]) -> Payload:
     document = schema.LocalizeRequest.model_validate(json.loads(parts["request"]))
-    message = request_message(Asked(document, ((parts["rgb"], parts["depth"]),)))
+    message = request_message(PreparedRequest(document, ((parts["rgb"], parts["depth"]),)))
     return Payload(*multipart(parts), message, None)
 
 

@@ -147,9 +147,14 @@ def test_the_readmes_example_runs(served: Served, pictures: Any, tmp_path: Path)
     assert "http://127.0.0.1:8000" in found[1]
     program = found[1].replace("http://127.0.0.1:8000", served.url)
     done = subprocess.run(
-        [sys.executable, "-c", program], cwd=tmp_path, env=os.environ | {"PYTHONPATH": str(ROOT)},
-        capture_output=True, text=True, check=False, timeout=60,
-    )  # fmt: skip
+        [sys.executable, "-c", program],
+        cwd=tmp_path,
+        env=os.environ | {"PYTHONPATH": str(ROOT)},
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=60,
+    )
     assert (done.returncode, done.stderr) == (0, "")
     assert done.stdout.startswith("LOCALIZED ")
     assert done.stdout.endswith("['tiny']\n")

@@ -23,8 +23,18 @@ ENVIRONMENT = {name: value for name, value in os.environ.items() if name not in 
 def arguments(encoder_of: Callable[..., bytes], tmp_path_factory: pytest.TempPathFactory) -> list[str]:
     folder = tmp_path_factory.mktemp("demo")
     (folder / "encoder.onnx").write_bytes(encoder_of())
-    return [*COMMAND, "demo", "--streets", "3", "--queries", "3", "--encoder", str(folder / "encoder.onnx"),
-            "--out", str(folder / "out")]  # fmt: skip
+    return [
+        *COMMAND,
+        "demo",
+        "--streets",
+        "3",
+        "--queries",
+        "3",
+        "--encoder",
+        str(folder / "encoder.onnx"),
+        "--out",
+        str(folder / "out"),
+    ]
 
 
 def run(arguments: list[str]) -> "subprocess.CompletedProcess[str]":
@@ -61,9 +71,14 @@ def test_with_once_it_says_how_to_serve_again(once: str) -> None:
 def serving(arguments: list[str], once: str) -> Iterator[tuple["subprocess.Popen[str]", str, str]]:
     """A demo that goes on serving over what ``once`` made: process, address, and what it printed."""
     process = subprocess.Popen(
-        arguments, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=ENVIRONMENT,
+        arguments,
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        env=ENVIRONMENT,
         preexec_fn=_mind_ctrl_c,
-    )  # fmt: skip
+    )
     assert process.stdout is not None
     printed = ""
     for line in process.stdout:

@@ -21,8 +21,9 @@ Parts = Callable[..., dict[str, bytes]]
 def service(bundle_path: Path) -> Iterator[dict[str, Any]]:
     process = subprocess.Popen(
         [*COMMAND, "serve", str(bundle_path), "--threads", "1", "--queue", "1", "--port", "0", "--grpc-port", "0"],
-        stdout=subprocess.PIPE, text=True,
-    )  # fmt: skip
+        stdout=subprocess.PIPE,
+        text=True,
+    )
     found: dict[str, Any] = {"pid": process.pid}
     assert process.stdout is not None
     for line in process.stdout:

@@ -51,8 +51,10 @@ def start(bundle_path: Path, tmp_path: Path) -> Iterator[Start]:
             process = subprocess.Popen(
                 [*COMMAND, "serve", str(bundle_path), "--threads", "1", "--port", "0", "--grpc-port", "0"],
                 env={"PATH": "", **{f"STREETFIX_{name.upper()}": str(value) for name, value in told.items()}},
-                stdout=subprocess.PIPE, stderr=file, text=True,
-            )  # fmt: skip
+                stdout=subprocess.PIPE,
+                stderr=file,
+                text=True,
+            )
         assert process.stdout is not None
         found: dict[str, str] = {}
         for line in process.stdout:
@@ -204,9 +206,14 @@ def test_the_health_port_is_plain_and_open_where_the_others_ask_for_certificates
     port = service.health.rsplit(":", 1)[1].removesuffix("/readyz")
     base = f"http://127.0.0.1:{port}"
     for path, status in (
-        ("/livez", 200), ("/readyz", 200), ("/metrics", 404), ("/v1/maps", 404), ("/openapi.json", 404), ("/console/", 404),
+        ("/livez", 200),
+        ("/readyz", 200),
+        ("/metrics", 404),
+        ("/v1/maps", 404),
+        ("/openapi.json", 404),
+        ("/console/", 404),
         ("/v1/localize", 404),
-    ):  # fmt: skip
+    ):
         assert httpx.get(base + path, headers={"Host": "10.1.2.3:8001"}).status_code == status, path
     environment = {"PATH": "", "STREETFIX_HEALTH_PORT": port}
     asked = [*COMMAND, "health"]

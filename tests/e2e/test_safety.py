@@ -31,8 +31,10 @@ def start(bundle_path: Path) -> Iterator[Start]:
         environment = {f"STREETFIX_{name.upper()}": str(value) for name, value in settings.items()}
         process = subprocess.Popen(
             [*COMMAND, "serve", str(bundle_path), "--threads", "1", "--port", "0", "--grpc-port", "0"],
-            env={"PATH": "", **environment}, stdout=subprocess.PIPE, text=True,
-        )  # fmt: skip
+            env={"PATH": "", **environment},
+            stdout=subprocess.PIPE,
+            text=True,
+        )
         running.append(process)
         assert process.stdout is not None
         found: dict[str, str] = {}
@@ -97,9 +99,13 @@ def test_with_keys_both_faces_ask_for_one_and_health_stays_open(start: Start, tm
 def refused(bundle: Path, **settings: object) -> str:
     environment = {f"STREETFIX_{name.upper()}": str(value) for name, value in settings.items()}
     done = subprocess.run(
-        [*COMMAND, "serve", str(bundle), "--port", "0"], env={"PATH": "", **environment}, capture_output=True, text=True,
-        check=False, timeout=60,
-    )  # fmt: skip
+        [*COMMAND, "serve", str(bundle), "--port", "0"],
+        env={"PATH": "", **environment},
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=60,
+    )
     assert done.returncode == 1
     assert "Traceback" not in done.stderr
     return done.stderr
@@ -174,9 +180,13 @@ def test_tls_is_spoken_by_both_faces(start: Start, pem: dict[str, Path], mutual:
 def test_check_says_what_would_be_served_and_leaves(bundle_path: Path, tmp_path: Path) -> None:
     _, keys = made_key(tmp_path)
     done = subprocess.run(
-        [*COMMAND, "serve", str(bundle_path), "--check", "--threads", "3"], env={"PATH": "", "STREETFIX_API_KEYS": str(keys)},
-        capture_output=True, text=True, check=False, timeout=60,
-    )  # fmt: skip
+        [*COMMAND, "serve", str(bundle_path), "--check", "--threads", "3"],
+        env={"PATH": "", "STREETFIX_API_KEYS": str(keys)},
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=60,
+    )
     assert (done.returncode, done.stderr) == (0, "")
     assert '"threads": 3' in done.stdout
     assert re.search(r"map tiny \w+: opens and answers\nkeys: 1\n$", done.stdout)
@@ -198,9 +208,12 @@ def test_the_log_has_a_line_for_each_request_and_nothing_of_its_content(
 ) -> None:
     settings = {"STREETFIX_LOG_STYLE": "json", "STREETFIX_LOG_LEVEL": "info"}
     process = subprocess.Popen(
-        [*COMMAND, "serve", str(bundle_path), "--threads", "1", "--port", "0"], env={"PATH": "", **settings},
-        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
-    )  # fmt: skip
+        [*COMMAND, "serve", str(bundle_path), "--threads", "1", "--port", "0"],
+        env={"PATH": "", **settings},
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
     assert process.stdout is not None
     url = next(found[1] for line in process.stdout if (found := re.search(r"serving at (\S+)", line)))
     files = {name: (name, data) for name, data in parts_of().items()}

@@ -30,9 +30,11 @@ class Service:
     def __init__(self, folder: Path, **settings: object) -> None:
         environment = {f"STREETFIX_{name.upper()}": str(value) for name, value in settings.items()}
         self.process = subprocess.Popen(
-            [*COMMAND, "serve", str(folder), "--threads", "2", "--port", "0"], env={"PATH": "", **environment},
-            stdout=subprocess.PIPE, text=True,
-        )  # fmt: skip
+            [*COMMAND, "serve", str(folder), "--threads", "2", "--port", "0"],
+            env={"PATH": "", **environment},
+            stdout=subprocess.PIPE,
+            text=True,
+        )
         assert self.process.stdout is not None
         self.url = next(found[1] for line in self.process.stdout if (found := re.search(r"serving at (\S+)", line)))
 

@@ -34,9 +34,12 @@ WORKERS = 2
 class Service:
     def __init__(self, folder: Path) -> None:
         self.process = subprocess.Popen(
-            [*COMMAND, str(folder), "--workers", str(WORKERS), "--port", "0", "--grpc-port", "0"], text=True,
-            env={"PATH": "", "STREETFIX_WATCH_S": "0.2"}, stdout=subprocess.PIPE, stderr=subprocess.PIPE,
-        )  # fmt: skip
+            [*COMMAND, str(folder), "--workers", str(WORKERS), "--port", "0", "--grpc-port", "0"],
+            text=True,
+            env={"PATH": "", "STREETFIX_WATCH_S": "0.2"},
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+        )
         found: dict[str, str] = {}
         for line in self.process.stdout or ():
             if match := re.search(r"serving( gRPC)? at (\S+)", line):
@@ -244,9 +247,12 @@ def test_all_answers_name_one_version_while_workers_are_killed_and_versions_come
 
 def test_sigterm_during_the_start_ends_all_processes(folder: Path) -> None:
     process = subprocess.Popen(
-        [*COMMAND, str(folder), "--workers", "8", "--port", "0"], env={"PATH": ""}, stdout=subprocess.PIPE, stderr=subprocess.PIPE,
+        [*COMMAND, str(folder), "--workers", "8", "--port", "0"],
+        env={"PATH": ""},
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
         text=True,
-    )  # fmt: skip
+    )
     until = time.monotonic() + 60
     while len(descendants(process.pid)) < 3:  # itself and two workers, while it forks the others
         assert time.monotonic() < until
@@ -289,9 +295,13 @@ def test_a_damaged_bundle_beside_a_good_one_is_reported_and_nobody_is_kept_from_
         _, told = service.process.communicate(timeout=60)
     assert "map_refused" in told
     strict = subprocess.run(
-        [*COMMAND, str(folder), "--workers", "2", "--port", "0", "--strict"], env={"PATH": ""}, capture_output=True, text=True,
-        timeout=60, check=False,
-    )  # fmt: skip
+        [*COMMAND, str(folder), "--workers", "2", "--port", "0", "--strict"],
+        env={"PATH": ""},
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=False,
+    )
     assert strict.returncode == 1
     assert "views.faiss" in strict.stderr
 
@@ -306,9 +316,13 @@ def test_workers_leave_with_their_parent(service: Service) -> None:
 def test_a_map_that_cannot_be_opened_ends_the_service_with_its_message(folder: Path) -> None:
     (folder / "v0" / "manifest.json").write_text("{}")
     done = subprocess.run(
-        [*COMMAND, str(folder), "--workers", "2", "--port", "0"], env={"PATH": ""}, capture_output=True, text=True, timeout=60,
+        [*COMMAND, str(folder), "--workers", "2", "--port", "0"],
+        env={"PATH": ""},
+        capture_output=True,
+        text=True,
+        timeout=60,
         check=False,
-    )  # fmt: skip
+    )
     assert done.returncode == 1
     assert "manifest.json" in done.stderr
     assert "Traceback" not in done.stderr
@@ -317,8 +331,12 @@ def test_a_map_that_cannot_be_opened_ends_the_service_with_its_message(folder: P
 def test_a_port_that_is_taken_is_refused_though_workers_share_theirs(service: Service, folder: Path) -> None:
     port = service.url.rsplit(":", 1)[1]
     done = subprocess.run(
-        [*COMMAND, str(folder), "--workers", "2", "--port", port], env={"PATH": ""}, capture_output=True, text=True, timeout=60,
+        [*COMMAND, str(folder), "--workers", "2", "--port", port],
+        env={"PATH": ""},
+        capture_output=True,
+        text=True,
+        timeout=60,
         check=False,
-    )  # fmt: skip
+    )
     assert done.returncode == 1
     assert f"cannot listen on 127.0.0.1:{port}" in done.stderr

@@ -1,4 +1,4 @@
-"""A street of flat rectangles: its surfels, and what is seen of it from a known pose."""
+"""A street of flat rectangles: its surfels, and its view from a known pose."""
 
 from collections.abc import Callable
 from typing import Any
@@ -19,7 +19,7 @@ Floats = NDArray[np.float64]
 
 
 class Scene:
-    """Rectangles, each a corner and two edges that are square to each other (metres, map frame)."""
+    """Rectangles, each with a corner and two perpendicular edges (metres, map frame)."""
 
     def __init__(self, *rectangles: tuple[Any, Any, Any]) -> None:
         self.corners, self.a, self.b = (np.array(each, np.float64) for each in zip(*rectangles, strict=True))
@@ -27,7 +27,7 @@ class Scene:
         self.normals = normals / np.linalg.norm(normals, axis=1, keepdims=True)
 
     def surfels(self, step_m: float = 0.3) -> NDArray[Any]:
-        """One every ``step_m``, exactly on its rectangle."""
+        """Return one surfel every ``step_m``, exactly on its rectangle."""
         found = []
         for corner, a, b, normal in zip(self.corners, self.a, self.b, self.normals, strict=True):
             shares = [(np.arange(n) + 0.5) / n for n in (max(1, round(np.linalg.norm(e) / step_m)) for e in (a, b))]
@@ -39,7 +39,7 @@ class Scene:
         return np.concatenate(found)
 
     def survey(self, *, noise_m: float = 0.01, per_m2: float = 150.0, origin: Any = (0.0, 0.0, 0.0)) -> SurfelMap:
-        """The cloud as a map's build makes it from measured points."""
+        """Return the cloud that a map build makes from measured points."""
         rng = np.random.default_rng(11)
         voxels = VoxelMap(0.3, np.array(origin, np.float64))
         for corner, a, b in zip(self.corners, self.a, self.b, strict=True):
@@ -49,7 +49,7 @@ class Scene:
         return SurfelMap.prepare(voxels.origin, *voxels.tiles(voxels.surfels()))
 
     def ranges(self, origin_m: Floats, directions: Floats) -> Floats:
-        """How many directions it is to the first rectangle; infinite where none is met."""
+        """Return the distance along each direction to the first rectangle; infinite without an intersection."""
         found = np.full(len(directions), np.inf)
         for corner, a, b, normal in zip(self.corners, self.a, self.b, self.normals, strict=True):
             toward = directions @ normal
@@ -62,13 +62,13 @@ class Scene:
         return found
 
     def depth(self, camera: PinholeCamera, T_map_camera: Floats) -> NDArray[np.float32]:
-        """The picture that a faultless depth camera takes; 0 where nothing is met."""
+        """Return the depth image of an exact depth camera; 0 without an intersection."""
         rays = camera.rays_of_pixels().reshape(-1, 3) @ T_map_camera[:3, :3].T
         z = self.ranges(T_map_camera[:3, 3], rays).reshape(camera.height, camera.width)
         return np.where(np.isfinite(z), z, 0).astype(np.float32)
 
     def points(self, R_map_level: Floats, camera_m: Floats, *, focal_baseline_px_m: float = 80.0) -> QueryPoints:
-        """Faultless points of a fan of 110 x 40 degrees."""
+        """Return exact points of a fan of 110 x 40 degrees."""
         azimuth, elevation = np.meshgrid(np.deg2rad(np.linspace(-55, 55, 45)), np.deg2rad(np.linspace(-25, 15, 27)))
         fan = [np.cos(azimuth) * np.cos(elevation), np.sin(azimuth) * np.cos(elevation), np.sin(elevation)]
         rays = np.stack(fan, axis=-1).reshape(-1, 3)
@@ -78,19 +78,22 @@ class Scene:
 
 
 def query_points(xyz: Any, *, sigma: Any = 0.02, weight: Any = 1.0, focal_baseline_px_m: float = np.inf) -> QueryPoints:
-    """Points of a level frame; without a base line the camera knows no disparity offset."""
+    """Return query points in a level frame. Without a baseline the camera has no disparity offset."""
     xyz = np.array(xyz, np.float64).reshape(-1, 3)
     f, n = np.float32, len(xyz)
     return QueryPoints(
-        xyz.astype(f), (xyz / np.linalg.norm(xyz, axis=1, keepdims=True)).astype(f), np.full(n, sigma, f),
-        np.broadcast_to(np.asarray(weight, f), n).copy(), (xyz[:, 0] / focal_baseline_px_m).astype(f),
-    )  # fmt: skip
+        xyz.astype(f),
+        (xyz / np.linalg.norm(xyz, axis=1, keepdims=True)).astype(f),
+        np.full(n, sigma, f),
+        np.broadcast_to(np.asarray(weight, f), n).copy(),
+        (xyz[:, 0] / focal_baseline_px_m).astype(f),
+    )
 
 
 def states_at(
     R: Floats, t: Any, *, log_scale: float = 0.0, offset: float = 0.0, anchor: Any = None, up: Any = None
 ) -> Any:
-    """One start, its priors at itself unless told otherwise."""
+    """Return one start, with its priors at its own pose by default."""
     states = np.zeros(1, STATE)
     states["R"], states["t"], states["log_scale"], states["offset"] = R, t, log_scale, offset
     states["anchor"] = t if anchor is None else anchor
@@ -103,7 +106,7 @@ FINE = {"iterations": 20, "reach": 1.2, "robust_first": 0.6, "robust_last": 0.06
 
 
 def settled(cloud: SurfelMap, points: QueryPoints, states: Any, **changed: Any) -> Any:
-    """Rough, then exact; the starts given stay as they are."""
+    """Run a coarse and an exact solver. The given starts stay unchanged."""
     states = states.copy()
     align(cloud.grid, cloud.surfels, points, states, SolverOptions(**(COARSE | changed)))
     align(cloud.grid, cloud.surfels, points, states, SolverOptions(**(FINE | changed)))
@@ -111,22 +114,27 @@ def settled(cloud: SurfelMap, points: QueryPoints, states: Any, **changed: Any) 
 
 
 def box(low: Any, high: Any) -> list[tuple[Any, Any, Any]]:
-    """The four sides and the top of a box."""
+    """Return the four sides and the top of a box."""
     (x0, y0, z0), (x, y, z) = low, np.array(high) - low
     return [
-        ((x0, y0, z0), (x, 0, 0), (0, 0, z)), ((x0, y0 + y, z0), (x, 0, 0), (0, 0, z)),
-        ((x0, y0, z0), (0, y, 0), (0, 0, z)), ((x0 + x, y0, z0), (0, y, 0), (0, 0, z)),
+        ((x0, y0, z0), (x, 0, 0), (0, 0, z)),
+        ((x0, y0 + y, z0), (x, 0, 0), (0, 0, z)),
+        ((x0, y0, z0), (0, y, 0), (0, 0, z)),
+        ((x0 + x, y0, z0), (0, y, 0), (0, 0, z)),
         ((x0, y0, z0 + z), (x, 0, 0), (0, y, 0)),
-    ]  # fmt: skip
+    ]
 
 
 def street_at(x0: float, y0: float) -> list[tuple[Any, Any, Any]]:
-    """Ground, two facades, the end of the street, a lorry on the left and a pillar on the right; 30 x 12 m."""
+    """Return ground, two facades, the end of the street, a lorry on the left and a pillar on the right; 30 x 12 m."""
     return [
-        ((x0, y0 - 6, 0), (30, 0, 0), (0, 12, 0)), ((x0, y0 - 6, 0), (30, 0, 0), (0, 0, 5)),
-        ((x0, y0 + 6, 0), (30, 0, 0), (0, 0, 5)), ((x0 + 30, y0 - 6, 0), (0, 12, 0), (0, 0, 5)),
-        *box((x0 + 14, y0 + 3, 0), (x0 + 19, y0 + 5, 3)), *box((x0 + 11, y0 - 4, 0), (x0 + 11.6, y0 - 3.4, 4)),
-    ]  # fmt: skip
+        ((x0, y0 - 6, 0), (30, 0, 0), (0, 12, 0)),
+        ((x0, y0 - 6, 0), (30, 0, 0), (0, 0, 5)),
+        ((x0, y0 + 6, 0), (30, 0, 0), (0, 0, 5)),
+        ((x0 + 30, y0 - 6, 0), (0, 12, 0), (0, 0, 5)),
+        *box((x0 + 14, y0 + 3, 0), (x0 + 19, y0 + 5, 3)),
+        *box((x0 + 11, y0 - 4, 0), (x0 + 11.6, y0 - 3.4, 4)),
+    ]
 
 
 @pytest.fixture(scope="session")
@@ -136,14 +144,14 @@ def street() -> Scene:
 
 @pytest.fixture(scope="session")
 def street_map(street: Scene) -> SurfelMap:
-    """Surfels exactly on the street's rectangles, in one tile."""
+    """Return surfels exactly on the rectangles of the street, in one tile."""
     surfels = street.surfels()
     return SurfelMap.prepare(np.zeros(3), surfels, np.array([[9.0, 0.0, 0.0, len(surfels)]]))
 
 
 @pytest.fixture(scope="session")
 def pose() -> tuple[Floats, Floats]:
-    """Where the street is seen from: R_map_level and the camera's position, 1.5 m above the ground."""
+    """Return the true pose: R_map_level and camera position, 1.5 m above the ground."""
     return rotation_z(np.deg2rad(8.0)), np.array([0.7, -0.4, 1.5])
 
 
@@ -179,7 +187,7 @@ def settle() -> Callable[..., Any]:
 
 @pytest.fixture(scope="session")
 def candidate():
-    """Make a registered pose of some support."""
+    """Return a registered candidate with a given support."""
 
     def made(support=0.0, *, xyz=(0.0, 0.0, 1.5), heading_deg=0.0, scale=1.0):
         R = rotation_z(np.deg2rad(heading_deg))

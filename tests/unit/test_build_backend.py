@@ -1,4 +1,4 @@
-"""The build backend's own part: which compiler, and where nothing can be built."""
+"""Our part of the build backend: the choice of the compiler, and the error without one."""
 
 import importlib.util
 import shutil
@@ -25,7 +25,7 @@ def backend() -> ModuleType:
 
 @pytest.fixture
 def machine(monkeypatch):
-    """A machine on which only these programs are installed, and only these variables of the build are set."""
+    """Return a machine with only these programs and these build variables."""
 
     def of(*programs, **variables):
         found = {"cmake": shutil.which("cmake"), "ninja": shutil.which("ninja")}
@@ -42,7 +42,7 @@ def machine(monkeypatch):
 
 @pytest.fixture
 def standard(backend, monkeypatch):
-    """The settings that scikit-build-core is given."""
+    """Return the settings that scikit-build-core receives."""
     given = []
     for name in ("build_wheel", "build_editable"):
         monkeypatch.setattr(
@@ -82,8 +82,9 @@ def test_a_machine_without_a_compiler_takes_one_from_the_package_index(backend, 
     backend.build_editable("folder")
     zig = f"{Path(ziglang.__file__).with_name('zig')};cc"
     assert standard == [
-        {"wheel.packages": "service", "cmake.define.CMAKE_C_COMPILER": zig}, {"cmake.define.CMAKE_C_COMPILER": zig}
-    ]  # fmt: skip
+        {"wheel.packages": "service", "cmake.define.CMAKE_C_COMPILER": zig},
+        {"cmake.define.CMAKE_C_COMPILER": zig},
+    ]
 
 
 def test_without_any_compiler_the_message_says_how_to_get_one(backend, machine, standard, monkeypatch):
@@ -101,9 +102,11 @@ def test_where_the_service_cannot_run_nothing_is_built(backend, monkeypatch, sta
     monkeypatch.setattr(backend.sys, "platform", system)
     monkeypatch.setattr(backend.platform, "machine", lambda: processor)
     steps = (
-        backend.get_requires_for_build_wheel, backend.get_requires_for_build_editable,
-        lambda: backend.build_wheel("folder"), lambda: backend.build_editable("folder"),
-    )  # fmt: skip
+        backend.get_requires_for_build_wheel,
+        backend.get_requires_for_build_editable,
+        lambda: backend.build_wheel("folder"),
+        lambda: backend.build_editable("folder"),
+    )
     for step in steps:
         with pytest.raises(
             SystemExit, match=rf"cannot be built for {system} \({processor}\): it runs on Linux \(x86-64"

@@ -1,4 +1,4 @@
-"""The loader of the compiled libraries: what C and Python say of a shared structure must be the same."""
+"""The loader of the compiled libraries: C and Python must declare shared structures equally."""
 
 import ctypes
 import re
@@ -20,7 +20,7 @@ LIBRARIES = (gather.LIBRARY, level.LIBRARY, kernel.LIBRARY, points.LIBRARY, visi
 
 @pytest.mark.parametrize("loaded", [gather._library, level._library, kernel._library, points._library, visibility._library,
                                     rays._library, depth16.library])  # fmt: skip
-def test_what_was_built_fits_what_python_declares(loaded):
+def test_the_compiled_layout_fits_the_python_declarations(loaded):
     assert loaded() is not None
 
 
@@ -82,7 +82,7 @@ def test_a_library_that_was_not_compiled_is_named():
         load(Path(__file__).with_name("_nothing.so"))
 
 
-def test_every_structure_that_a_library_tells_of_is_compared():
+def test_every_structure_in_the_table_of_a_library_is_compared():
     source = "".join(path.read_text() for path in Path(service.__file__).parent.rglob("*.py"))
     for library in LIBRARIES:
         structures = {name.partition(".")[0] for name in compiled_layout(ctypes.CDLL(str(library)))}
@@ -93,13 +93,13 @@ def test_every_structure_that_a_library_tells_of_is_compared():
 
 @pytest.mark.parametrize("path", sorted(Path(service.__file__).parent.rglob("*.c")), ids=lambda path: path.stem)
 def test_every_structure_that_a_function_takes_is_in_its_library_s_table(path):
-    """``const View *v`` of an exported function, if the struct is Python's too."""
+    """Arguments such as ``const View *v`` of exported functions, for structs that Python declares too."""
     exported = re.findall(r"^(?:WIDE )?\w+ streetfix_\w+\(([^)]*)\)", path.read_text(), re.MULTILINE)
     taken = {name for arguments in exported for name in re.findall(r"\b([A-Z][a-z]\w*) \*", arguments)}
     library = ctypes.CDLL(str(path.with_name(f"_{path.stem}.so")))
     assert taken <= set(compiled_layout(library))
 
 
-def test_a_dtype_and_a_structure_of_the_same_fields_lie_alike():
+def test_a_dtype_and_a_structure_with_equal_fields_have_equal_layouts():
     dtype = np.dtype([("height", "<i8"), ("width", "<i8"), *((name, "<f8") for name in ("fx", "fy", "cx", "cy"))])
     assert declared_layout("Picture", dtype) == declared_layout("Picture", CPicture)

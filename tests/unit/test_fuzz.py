@@ -1,4 +1,4 @@
-"""A short fuzz run over every parser of untrusted input. ``make fuzz`` is the long run, guided by coverage."""
+"""A short fuzz run over every parser of untrusted input. ``make fuzz`` is the long run with coverage guidance."""
 
 import random
 from pathlib import Path
@@ -20,7 +20,7 @@ def known(bundle_path: Path, tmp_path_factory: pytest.TempPathFactory):
 
 
 def changed(data: bytes, chance: random.Random) -> bytes:
-    """Flipped, cut, doubled, overwritten at some places."""
+    """Return bytes with flips, cuts, duplications and overwrites at some positions."""
     found = bytearray(data)
     for _ in range(chance.randint(1, 6)):
         at, length = chance.randrange(len(found) + 1), chance.randint(1, 16)

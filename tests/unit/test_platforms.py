@@ -1,4 +1,4 @@
-"""Where the service does not run, it says so, once and in one line."""
+"""On unsupported platforms the service exits at once with one line."""
 
 import platform
 import subprocess
@@ -33,10 +33,14 @@ def test_others_are_refused_by_name(monkeypatch, system, machine):
 
 
 def after(change: str, statement: str) -> "subprocess.CompletedProcess[str]":
-    """Run a statement where the platform says something else."""
+    """Run a statement on a fake platform."""
     return subprocess.run(
-        [sys.executable, "-c", f"import platform; {change}; {statement}"], cwd=ROOT, capture_output=True, text=True, check=False
-    )  # fmt: skip
+        [sys.executable, "-c", f"import platform; {change}; {statement}"],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
 
 
 RISCV = "platform.machine = lambda: 'riscv64'"

@@ -1,4 +1,4 @@
-"""``import streetfix``: the names that most programs need, each loaded when it is used."""
+"""``import streetfix``: the names that most programs need, each loaded on first use."""
 
 import subprocess
 import sys

@@ -8,7 +8,7 @@ from service.timing import STAGES, StageTimer
 
 @pytest.fixture
 def timer(monkeypatch):
-    """A timer whose clock is read at whole seconds, so that every block takes one."""
+    """Return a timer with a clock of whole seconds. Every block takes one second."""
     monkeypatch.setattr(timing, "perf_counter", itertools.count().__next__)
     return StageTimer()
 
@@ -18,8 +18,12 @@ def test_blocks_of_one_stage_add_up(timer):
         with timer.stage(stage):
             pass
     assert {stage: timer.ms(stage) for stage in STAGES} == {
-        "decode": 0, "fuse": 2000, "encode": 0, "search": 1000, "register": 0
-    }  # fmt: skip
+        "decode": 0,
+        "fuse": 2000,
+        "encode": 0,
+        "search": 1000,
+        "register": 0,
+    }
     assert timer.total_ms == 3000
 
 

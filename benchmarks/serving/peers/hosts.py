@@ -44,12 +44,21 @@ class Host:
         self._folder = Path(tempfile.mkdtemp(prefix="peer-"))  # some peers write files where they are started
         # The peers use the code of this checkout. They do not import the parts whose dependencies their environments
         # lack.
-        environment = os.environ | {"PYTHONPATH": str(ROOT), "BENTOML_HOME": str(self._folder), "BENTOML_DO_NOT_TRACK": "True"}  # fmt: skip
+        environment = os.environ | {
+            "PYTHONPATH": str(ROOT),
+            "BENTOML_HOME": str(self._folder),
+            "BENTOML_DO_NOT_TRACK": "True",
+        }
         with (self._folder / "log").open("wb") as log:
             self.process = subprocess.Popen(
-                [*command, str(port)], cwd=self._folder, env=environment, stdin=subprocess.DEVNULL, stdout=log, stderr=log,
+                [*command, str(port)],
+                cwd=self._folder,
+                env=environment,
+                stdin=subprocess.DEVNULL,
+                stdout=log,
+                stderr=log,
                 start_new_session=True,
-            )  # fmt: skip
+            )
         pin(self.process.pid, core)
         try:
             self._wait(first, patience_s)
@@ -104,8 +113,11 @@ class Host:
                 raise PeerError(f"the server ended with code {self.process.returncode}: {self._said()}")
             try:
                 answered = httpx.post(
-                    f"{self.url}/v1/localize", content=first.body, headers={"Content-Type": first.content_type}, timeout=30
-                )  # fmt: skip
+                    f"{self.url}/v1/localize",
+                    content=first.body,
+                    headers={"Content-Type": first.content_type},
+                    timeout=30,
+                )
             except httpx.TransportError as error:
                 last = type(error).__name__
             else:

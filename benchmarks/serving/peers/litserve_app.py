@@ -62,9 +62,13 @@ def main() -> None:
         fast_queue=True,
     )
     server.run(
-        host="127.0.0.1", port=int(sys.argv[2]), num_api_servers=1, log_level="warning", generate_client_file=False,
+        host="127.0.0.1",
+        port=int(sys.argv[2]),
+        num_api_servers=1,
+        log_level="warning",
+        generate_client_file=False,
         access_log=False,
-    )  # fmt: skip
+    )
 
 
 if __name__ == "__main__":

@@ -43,13 +43,19 @@ def main() -> None:
     """Write the settings to the current folder, and replace this process by ``mlserver start``."""
     bundle, port = sys.argv[1:]
     settings = {
-        "debug": False, "parallel_workers": 0, "host": "127.0.0.1", "http_port": int(port), "grpc_port": free_port(),
-        "metrics_endpoint": None, "gzip_enabled": False,
-    }  # fmt: skip
+        "debug": False,
+        "parallel_workers": 0,
+        "host": "127.0.0.1",
+        "http_port": int(port),
+        "grpc_port": free_port(),
+        "metrics_endpoint": None,
+        "gzip_enabled": False,
+    }
     model = {
-        "name": "streetfix", "implementation": "benchmarks.serving.peers.mlserver_app.Localization",
+        "name": "streetfix",
+        "implementation": "benchmarks.serving.peers.mlserver_app.Localization",
         "parameters": {"uri": bundle},
-    }  # fmt: skip
+    }
     Path("settings.json").write_text(json.dumps(settings))
     Path("model-settings.json").write_text(json.dumps(model))
     command = Path(sys.executable).with_name("mlserver")

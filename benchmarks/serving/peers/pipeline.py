@@ -64,12 +64,21 @@ class Pipeline:
         read = parsed(request, LocalizeRequest) if isinstance(request, bytes) else request
         asked = query_from(read, rgb=rgb, depth=depth)
         depth_m = decode_depth(
-            depth, camera=asked.camera, encoding=asked.depth_encoding, scale_m=asked.scale_m, kind=asked.depth_kind,
-            baseline_m=asked.baseline_m, max_range_m=asked.max_range_m,
-        )  # fmt: skip
-        query = Query(
-            rgb=decode_rgb(rgb), depth_m=depth_m, camera=asked.camera, neighbours=asked.neighbours, refine=asked.refine,
+            depth,
+            camera=asked.camera,
+            encoding=asked.depth_encoding,
+            scale_m=asked.scale_m,
+            kind=asked.depth_kind,
             baseline_m=asked.baseline_m,
-        )  # fmt: skip
+            max_range_m=asked.max_range_m,
+        )
+        query = Query(
+            rgb=decode_rgb(rgb),
+            depth_m=depth_m,
+            camera=asked.camera,
+            neighbours=asked.neighbours,
+            refine=asked.refine,
+            baseline_m=asked.baseline_m,
+        )
         answer = answer_from(Located(self._localizer.localize(query), self._bundle))
         return answer.model_dump_json(by_alias=True).encode()

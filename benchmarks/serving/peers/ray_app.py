@@ -15,11 +15,15 @@ from pathlib import Path
 from benchmarks.serving.peers.pipeline import PATH, Pipeline, parts_of  # first: it limits the pools
 
 FLAGS = {
-    "RAY_SERVE_THROUGHPUT_OPTIMIZED": "1", "RAY_SERVE_ENABLE_HA_PROXY": "1", "RAY_SERVE_HAPROXY_METRICS_ENABLED": "0",
-    "RAY_SERVE_CONTROL_LOOP_INTERVAL_S": "1", "RAY_enable_metrics_collection": "0", "RAY_USAGE_STATS_ENABLED": "0",
+    "RAY_SERVE_THROUGHPUT_OPTIMIZED": "1",
+    "RAY_SERVE_ENABLE_HA_PROXY": "1",
+    "RAY_SERVE_HAPROXY_METRICS_ENABLED": "0",
+    "RAY_SERVE_CONTROL_LOOP_INTERVAL_S": "1",
+    "RAY_enable_metrics_collection": "0",
+    "RAY_USAGE_STATS_ENABLED": "0",
     "RAY_AUTH_MODE": "disabled",
     "RAY_worker_niceness": "0",  # otherwise its workers yield to all other processes
-}  # fmt: skip
+}
 os.environ.update(FLAGS)  # Ray reads them at import
 
 import ray  # noqa: E402  # after its flags
@@ -46,8 +50,12 @@ def main() -> None:
     """Serve until SIGTERM."""
     bundle, port = sys.argv[1:]
     ray.init(
-        num_cpus=1, include_dashboard=False, log_to_driver=False, _node_ip_address="127.0.0.1", _temp_dir=str(Path.cwd() / "ray")
-    )  # fmt: skip
+        num_cpus=1,
+        include_dashboard=False,
+        log_to_driver=False,
+        _node_ip_address="127.0.0.1",
+        _temp_dir=str(Path.cwd() / "ray"),
+    )
     serve.start(http_options={"host": "127.0.0.1", "port": int(port)}, logging_config={"enable_access_log": False})
     serve.run(Localization.bind(bundle), route_prefix=PATH)  # type: ignore[attr-defined]  # the decorator adds it
     told = threading.Event()

@@ -116,9 +116,13 @@ def towers_of(settings: LearnSettings, views: LidarViews) -> Towers:
 
     def tower(planes: int, size: tuple[int, int], *, around: bool = False) -> Tower:
         return Tower(
-            planes, size, widths=settings.widths, patch_pair=not all_round, descriptor=settings.descriptor,
+            planes,
+            size,
+            widths=settings.widths,
+            patch_pair=not all_round,
+            descriptor=settings.descriptor,
             around=around,
-        )  # fmt: skip
+        )
 
     return Towers(tower(CAMERA_PLANES, size_of(settings.kind)), tower(LIDAR_PLANES, views.size, around=all_round))
 
@@ -189,9 +193,11 @@ class Lesson:
                 frame = np.array([rng.choice(self.near[row]) for row in rows])
                 heading = self.poses[rows, 2] - self.sweeps.places[frame, 2] + rng.uniform(-turn, turn, len(rows))
                 yield (
-                    self.pictures.planes(rows, rng), torch.from_numpy(self.poses[rows, :2]).float(),
-                    self.views.planes(self.sweeps, frame, heading), torch.from_numpy(self.sweeps.places[frame, :2]).float(),
-                )  # fmt: skip
+                    self.pictures.planes(rows, rng),
+                    torch.from_numpy(self.poses[rows, :2]).float(),
+                    self.views.planes(self.sweeps, frame, heading),
+                    torch.from_numpy(self.sweeps.places[frame, :2]).float(),
+                )
 
 
 def learn(lesson: Lesson, settings: LearnSettings, folder: Path, *, budget_s: float, report: Report) -> Training:

@@ -24,8 +24,12 @@ class PaperCnn(nn.Module):
         before = 3
         for channels in CHANNELS:
             # Pool first: max pooling commutes with functions that never decrease, and this order is twice as fast.
-            layers += [nn.Conv2d(before, channels, 3, padding=1, bias=False), nn.MaxPool2d(2), nn.BatchNorm2d(channels),
-                       nn.ReLU(inplace=True)]  # fmt: skip
+            layers += [
+                nn.Conv2d(before, channels, 3, padding=1, bias=False),
+                nn.MaxPool2d(2),
+                nn.BatchNorm2d(channels),
+                nn.ReLU(inplace=True),
+            ]
             before = channels
         self.convolutions = nn.Sequential(*layers)
         side = SIDE // 2 ** len(CHANNELS)
@@ -60,6 +64,6 @@ def layer_table() -> list[tuple[str, str, str]]:
         rows.append(
             (f"{2 * k + 2} pooling", "maximum of 2 x 2, batch normalisation, ReLU", f"{side} x {side} x {channels}")
         )
-    rows.append(("11 full connection", f"{FEATURES} features: what K-NN compares", str(FEATURES)))
-    rows.append(("12 full connection", "softmax of the 16 classes", str(CLASSES)))
+    rows.append(("11 fully connected", f"{FEATURES} features, the descriptor of K-NN", str(FEATURES)))
+    rows.append(("12 fully connected", "softmax of the 16 classes", str(CLASSES)))
     return [(number, does, out) for number, does, out in rows]

@@ -99,7 +99,7 @@ def split_of(total: int) -> Split:
 
 
 def shown_pairs(total: int) -> NDArray[np.int64]:
-    """Return rows (n,) of the training pairs; every twentieth is kept aside, to end a training and to choose among variants.
+    """Return rows (n,) of the training pairs; every twentieth is held out, to end a training and to choose among variants.
 
     Args:
         total: number of pairs.

@@ -30,16 +30,16 @@ PLANS = {
     "one_space_both": CnnPlan("view", pairs_too=True),
 }
 WHAT = {
-    "as_printed": "LiDAR from above, aligned by PCA, 84 iterations; queried with fused images as the camera sees them",
-    "converged": "the same, trained until it stops gaining",
-    "without_pca": "the same without PCA",
-    "one_space": "both on the view grid (azimuth x elevation); trained on LiDAR alone",
-    "one_space_both": "both on the view grid; trained on LiDAR frames and on fused pairs",
+    "as_printed": "LiDAR images from above, aligned by PCA, 84 iterations; queries are fused images in the camera's perspective",
+    "converged": "as `as_printed`, but trained until the validation accuracy stops rising",
+    "without_pca": "as `converged`, but without PCA",
+    "one_space": "LiDAR and fused images on the view grid (azimuth x elevation); trained on LiDAR images only",
+    "one_space_both": "as `one_space`, but trained on LiDAR images and fused pairs",
 }
 
 
 @dataclass(frozen=True, eq=False)
-class Asked:
+class VariantAnswers:
     """Answers of a variant to one set of queries.
 
     Attributes:
@@ -63,7 +63,7 @@ class Variant:
 
     Attributes:
         name: name in ``PLANS``.
-        asked: answers by set of queries.
+        answers_by_set: answers by set of queries.
         processor_s: processor time of the training, seconds.
         images: images shown in training.
         curve: training curve.
@@ -71,7 +71,7 @@ class Variant:
     """
 
     name: str
-    asked: Mapping[str, Asked]
+    answers_by_set: Mapping[str, VariantAnswers]
     processor_s: float
     images: int
     curve: list[CurvePoint]
@@ -114,7 +114,7 @@ def run_variant(
     split, pictures = trainer.split, trainer.pictures
     gallery = _gallery(net, pictures, split, pairs if plan.pairs_too else None)
     centres = class_centres(frames.T_map_lidar[split.known, :2, 3], frames.street[split.known], CLASSES)
-    asked: dict[str, Asked] = {}
+    answers_by_set: dict[str, VariantAnswers] = {}
 
     def ask(
         key: str,
@@ -126,7 +126,7 @@ def run_variant(
         features, scores = outputs(net, drawn, len(street))
         neighbours = gallery.neighbours(features, max(KS))
         best = scores.argmax(axis=1)
-        asked[key] = Asked(
+        answers_by_set[key] = VariantAnswers(
             kind, PlaceAnswers(centres[best], best), {k: gallery.answers(neighbours[:, :k]) for k in KS}, xy, street
         )
 
@@ -135,8 +135,13 @@ def run_variant(
         ask(key, "LiDAR", lambda chosen: drawn.of(rows[chosen]), of.T_map_lidar[rows, :2, 3], of.street[rows])
 
     def rgbd(key: str, of: Pairs, rows: NDArray[np.int64], *, colour: bool = True) -> None:
-        ask(key, "RGB-D" if colour else "depth", lambda chosen: fused_pictures(of, rows[chosen], plan.space, colour=colour),
-            of.T_map_camera[rows, :2, 3], of.street[rows])  # fmt: skip
+        ask(
+            key,
+            "RGB-D" if colour else "depth",
+            lambda chosen: fused_pictures(of, rows[chosen], plan.space, colour=colour),
+            of.T_map_camera[rows, :2, 3],
+            of.street[rows],
+        )
 
     lidar("lidar.same_drive", frames, split.tested)
     lidar("lidar.other_drive", other_lidar, np.arange(len(other_lidar)))
@@ -144,7 +149,7 @@ def run_variant(
     for which, test in tests.items():
         rgbd(which, test, np.arange(len(test)))
         rgbd(f"depth.{which}", test, np.arange(len(test)), colour=False)
-    return Variant(name, asked, cost, images, told.curve, why)
+    return Variant(name, answers_by_set, cost, images, told.curve, why)
 
 
 def _gallery(net: PaperCnn, pictures: LidarPictures, split: Split, pairs: Pairs | None) -> Gallery:
@@ -170,11 +175,11 @@ def _gallery(net: PaperCnn, pictures: LidarPictures, split: Split, pairs: Pairs 
     return Gallery(np.concatenate(features), np.concatenate(xy), np.concatenate(street))
 
 
-def street_accuracy(answers: PlaceAnswers, asked: Asked) -> float:
+def street_accuracy(answers: PlaceAnswers, truth: VariantAnswers) -> float:
     """Return the share of queries with the correct class; an unanswered query is wrong.
 
     Args:
         answers: answers to the queries.
-        asked: the queries' ground truth.
+        truth: the queries' ground truth.
     """
-    return float((answers.street == asked.truth_street).mean())
+    return float((answers.street == truth.truth_street).mean())

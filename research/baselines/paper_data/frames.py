@@ -75,8 +75,12 @@ class Frames:
         """
         if not (folder / FINISHED).exists():
             raise DatasetError(f"{folder} has no complete frames; run make paper", field="frames")
-        return Frames(**{name: np.load(folder / f"{name}.npy", mmap_mode="r", allow_pickle=False)
-                         for name in Frames.__annotations__})  # fmt: skip
+        return Frames(
+            **{
+                name: np.load(folder / f"{name}.npy", mmap_mode="r", allow_pickle=False)
+                for name in Frames.__annotations__
+            }
+        )
 
     def __len__(self) -> int:
         return len(self.street)
@@ -149,9 +153,13 @@ def make_frames_at(
         DatasetError: the folder holds other frames.
     """
     made_of: dict[str, Any] = {
-        "format": FORMAT, "total": len(street), "lidar": LIDAR, "city_seed": CITY_SEED, "traversal": traversal,
+        "format": FORMAT,
+        "total": len(street),
+        "lidar": LIDAR,
+        "city_seed": CITY_SEED,
+        "traversal": traversal,
         "poses": hashlib.sha256(np.ascontiguousarray(T_map_lidar).tobytes()).hexdigest(),
-    }  # fmt: skip
+    }
     if _finished(folder, made_of):
         return Frames.open(folder)
     city = City(seed=CITY_SEED, name="paper")
@@ -190,10 +198,13 @@ def _make(
     folder.mkdir(parents=True, exist_ok=True)
     total, grid = len(street), ViewGrid()
     shapes: dict[str, tuple[tuple[int, ...], type]] = {
-        "aligned": ((total, SIZE, SIZE), np.uint8), "plain": ((total, SIZE, SIZE), np.uint8),
-        "panoramas": ((total, grid.rows, grid.around), np.float16), "intensities": ((total, grid.rows, grid.around), np.uint8),
-        "places": ((total, 4), np.float64), "T_map_lidar": ((total, 4, 4), np.float64),
-    }  # fmt: skip
+        "aligned": ((total, SIZE, SIZE), np.uint8),
+        "plain": ((total, SIZE, SIZE), np.uint8),
+        "panoramas": ((total, grid.rows, grid.around), np.float16),
+        "intensities": ((total, grid.rows, grid.around), np.uint8),
+        "places": ((total, 4), np.float64),
+        "T_map_lidar": ((total, 4, 4), np.float64),
+    }
     begun = folder / BEGUN
     if not begun.exists():
         for name, (shape, kind) in shapes.items():

@@ -62,8 +62,11 @@ class Pairs:
         if not (folder / "pairs.json").exists():
             raise DatasetError(f"{folder} has no complete pairs; run make paper", field="pairs")
         camera = PinholeCamera(**json.loads((folder / "pairs.json").read_text()))
-        arrays = {name: np.load(folder / f"{name}.npy", mmap_mode="r", allow_pickle=False)
-                  for name in Pairs.__annotations__ if name != "camera"}  # fmt: skip
+        arrays = {
+            name: np.load(folder / f"{name}.npy", mmap_mode="r", allow_pickle=False)
+            for name in Pairs.__annotations__
+            if name != "camera"
+        }
         return Pairs(**arrays, camera=camera)
 
     def __len__(self) -> int:
@@ -89,10 +92,13 @@ def make_pairs(dataset: Dataset, names: Sequence[str], folder: Path, *, report: 
     frames, grid = list(chain.from_iterable(dataset.queries(name) for name in names)), ViewGrid()
     count, shape = len(frames), (grid.rows, grid.columns)
     shapes: dict[str, tuple[tuple[int, ...], type]] = {
-        "rgb": ((count, SIDE, SIDE, 3), np.uint8), "depth_mm": ((count, SIDE, SIDE), np.uint16),
-        "ranges": ((count, *shape), np.float16), "colours": ((count, *shape, 3), np.uint8),
-        "views": ((count, 4), np.float64), "T_map_camera": ((count, 4, 4), np.float64),
-    }  # fmt: skip
+        "rgb": ((count, SIDE, SIDE, 3), np.uint8),
+        "depth_mm": ((count, SIDE, SIDE), np.uint16),
+        "ranges": ((count, *shape), np.float16),
+        "colours": ((count, *shape, 3), np.uint8),
+        "views": ((count, 4), np.float64),
+        "T_map_camera": ((count, 4, 4), np.float64),
+    }
     arrays = {
         name: np.lib.format.open_memmap(part / f"{name}.npy", mode="w+", dtype=kind, shape=size)
         for name, (size, kind) in shapes.items()
@@ -131,11 +137,11 @@ def _shrunk(frame: QueryFrame, grid: ViewGrid) -> dict[str, NDArray[np.generic]]
     heading = heading_of_body(T_map_level)
     return {
         "rgb": np.asarray(cv2.resize(rgb, (SIDE, SIDE), interpolation=cv2.INTER_AREA), np.uint8),
-        "depth_mm": np.rint(
-            np.asarray(cv2.resize(depth_m, (SIDE, SIDE), interpolation=cv2.INTER_NEAREST)) * 1000
-        ).clip(0, 65535).astype(np.uint16),
+        "depth_mm": np.rint(np.asarray(cv2.resize(depth_m, (SIDE, SIDE), interpolation=cv2.INTER_NEAREST)) * 1000)
+        .clip(0, 65535)
+        .astype(np.uint16),
         "ranges": ranges.astype(np.float16),
         "colours": np.rint(colour).clip(0, 255).astype(np.uint8),
         "views": np.array([T[0, 3], T[1, 3], heading, level.height_m]),
         "T_map_camera": T,
-    }  # fmt: skip
+    }

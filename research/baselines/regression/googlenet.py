@@ -133,17 +133,22 @@ class GoogLeNet(nn.Module):
             convolution(PLANES, 64, 7, stride=2), _halved(), convolution(64, 64), convolution(64, 192, 3), _halved()
         )
         self.until_4a = nn.Sequential(
-            Inception(192, (64, 96, 128, 16, 32, 32)), Inception(256, (128, 128, 192, 32, 96, 64)), _halved(),
+            Inception(192, (64, 96, 128, 16, 32, 32)),
+            Inception(256, (128, 128, 192, 32, 96, 64)),
+            _halved(),
             Inception(480, (192, 96, 208, 16, 48, 64)),
-        )  # fmt: skip
+        )
         self.until_4d = nn.Sequential(
-            Inception(512, (160, 112, 224, 24, 64, 64)), Inception(512, (128, 128, 256, 24, 64, 64)),
+            Inception(512, (160, 112, 224, 24, 64, 64)),
+            Inception(512, (128, 128, 256, 24, 64, 64)),
             Inception(512, (112, 144, 288, 32, 64, 64)),
-        )  # fmt: skip
+        )
         self.until_5b = nn.Sequential(
-            Inception(528, (256, 160, 320, 32, 128, 128)), _halved(), Inception(832, (256, 160, 320, 32, 128, 128)),
+            Inception(528, (256, 160, 320, 32, 128, 128)),
+            _halved(),
+            Inception(832, (256, 160, 320, 32, 128, 128)),
             Inception(832, (384, 192, 384, 48, 128, 128)),
-        )  # fmt: skip
+        )
         self.head = PoseHead(1024, 2048, dropout)
         self.auxiliary = nn.ModuleList([AuxiliaryHead(512, dropout), AuxiliaryHead(528, dropout)])
 

@@ -60,8 +60,11 @@ class MapCloud:
         order = np.lexsort((cell[:, 1], cell[:, 0]))
         cell, ordered = cell[order], shuffled[order]
         starts = np.flatnonzero((np.diff(cell, axis=0) != 0).any(axis=1)) + 1
-        return {(int(xy[0, 0]), int(xy[0, 1])): points
-                for xy, points in zip(np.split(cell, starts), np.split(ordered, starts), strict=True) if len(points)}  # fmt: skip
+        return {
+            (int(xy[0, 0]), int(xy[0, 1])): points
+            for xy, points in zip(np.split(cell, starts), np.split(ordered, starts), strict=True)
+            if len(points)
+        }
 
     @cached_property
     def target(self) -> tuple[Any, Any]:

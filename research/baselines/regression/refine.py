@@ -111,9 +111,15 @@ def by_icp(cloud: MapCloud, points_camera: PointsF64, T_map_camera: Transform) -
     (target, tree), source, T = cloud.target, package.PointCloud(points_camera), T_map_camera
     for reach_m in ICP_REACHES_M:
         found = package.align(
-            target, source, tree, T, registration_type=ICP_KIND, max_correspondence_distance=reach_m, num_threads=1,
+            target,
+            source,
+            tree,
+            T,
+            registration_type=ICP_KIND,
+            max_correspondence_distance=reach_m,
+            num_threads=1,
             max_iterations=ICP_ITERATIONS,
-        )  # fmt: skip
+        )
         T = np.asarray(found.T_target_source, np.float64)
         if not np.isfinite(T).all():
             return Refined(T_map_camera, registered=False)

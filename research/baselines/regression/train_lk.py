@@ -210,8 +210,11 @@ class _Learner:
         return float(torch.cat(apart).median()) * REACH_M if apart else float("nan")
 
     def state(self) -> dict[str, Any]:
-        return {"net": self._net.state_dict(), "optimiser": self._optimiser.state_dict(),
-                "numpy": json.dumps(self._rng.bit_generator.state)}  # fmt: skip
+        return {
+            "net": self._net.state_dict(),
+            "optimiser": self._optimiser.state_dict(),
+            "numpy": json.dumps(self._rng.bit_generator.state),
+        }
 
     def restore(self, state: dict[str, Any]) -> None:
         self._net.load_state_dict(state["net"])

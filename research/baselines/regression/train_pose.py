@@ -171,8 +171,9 @@ class PoseLearner:
         # The variances must fall from a city's width to a street's, and Adam's steps have the size of the rate. So
         # they get ten times the rate.
         groups = [
-            {"params": self._net.parameters()}, {"params": self._loss.parameters(), "weight_decay": 0.0, "times": 10.0}
-        ]  # fmt: skip
+            {"params": self._net.parameters()},
+            {"params": self._loss.parameters(), "weight_decay": 0.0, "times": 10.0},
+        ]
         self._optimiser = torch.optim.AdamW(groups, lr=settings.learning_rate, weight_decay=settings.weight_decay)
 
     def draw(self, shown: NDArray[np.int64]) -> NDArray[np.int64]:
@@ -219,11 +220,16 @@ class PoseLearner:
     def state(self) -> dict[str, Any]:
         """Return the state that a checkpoint keeps."""
         return {
-            "net": self._net.state_dict(), "loss": self._loss.state_dict(), "optimiser": self._optimiser.state_dict(),
-            "torch": torch.get_rng_state(), "numpy": json.dumps(self._rng.bit_generator.state),
-            "waiting": torch.from_numpy(self._waiting), "centre_m": list(self._frame.centre_m),
-            "scale_m": self._frame.scale_m, "side": self._settings.side,
-        }  # fmt: skip
+            "net": self._net.state_dict(),
+            "loss": self._loss.state_dict(),
+            "optimiser": self._optimiser.state_dict(),
+            "torch": torch.get_rng_state(),
+            "numpy": json.dumps(self._rng.bit_generator.state),
+            "waiting": torch.from_numpy(self._waiting),
+            "centre_m": list(self._frame.centre_m),
+            "scale_m": self._frame.scale_m,
+            "side": self._settings.side,
+        }
 
     def restore(self, state: dict[str, Any]) -> None:
         """Continue from a saved state.

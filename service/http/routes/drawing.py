@@ -6,7 +6,7 @@ from fastapi import APIRouter, Query
 from starlette.responses import Response
 
 from service.console.cloud import LEVELS, Clouds, places_bytes
-from service.http.body import Asking
+from service.http.body import RequestRunner
 from service.http.described import problems
 
 _BYTES = "application/octet-stream"
@@ -30,14 +30,14 @@ _PLACES: dict[int | str, dict[str, Any]] = {
 }
 
 
-def router_for(asking: Asking) -> APIRouter:
+def router_for(runner: RequestRunner) -> APIRouter:
     """Create the routes.
 
     Args:
-        asking: runs the work; holds the engine.
+        runner: runs the work; holds the engine.
     """
     router = APIRouter(tags=["console"])
-    registry, clouds = asking.engine.registry, Clouds()
+    registry, clouds = runner.engine.registry, Clouds()
 
     @router.get(
         "/v1/maps/{map}/cloud",
@@ -58,7 +58,7 @@ def router_for(asking: Asking) -> APIRouter:
         ] = 500_000,
     ) -> Response:
         bundle = registry.get(map).bundle
-        return Response(await asking.in_time(lambda: clouds.of(bundle, points)), media_type=_BYTES)
+        return Response(await runner.in_time(lambda: clouds.of(bundle, points)), media_type=_BYTES)
 
     @router.get(
         "/v1/maps/{map}/places",

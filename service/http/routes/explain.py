@@ -8,18 +8,18 @@ from service.console.explain import explain
 from service.console.message import explanation_message
 from service.contract import schema
 from service.contract.convert import parsed, query_from
-from service.http.body import MOST_PARTS, Asking, Body, require_parts
+from service.http.body import MOST_PARTS, Body, RequestRunner, require_parts
 from service.http.described import LOCALIZE_BODY, problems
 
 
-def router_for(asking: Asking) -> APIRouter:
+def router_for(runner: RequestRunner) -> APIRouter:
     """Create the route.
 
     Args:
-        asking: reads the bodies; holds the engine.
+        runner: reads the bodies; holds the engine.
     """
     router = APIRouter(tags=["console"])
-    engine = asking.engine
+    engine = runner.engine
 
     @router.post(
         "/v1/explain",
@@ -41,13 +41,13 @@ def router_for(asking: Asking) -> APIRouter:
             def work() -> bytes:
                 parts = body.split(content_type, max_parts=MOST_PARTS)
                 require_parts(parts, ("rgb", "depth", "request"))
-                asked = parsed(parts["request"], schema.LocalizeRequest)
-                explanation = explain(engine, query_from(asked, rgb=parts["rgb"], depth=parts["depth"]))
+                document = parsed(parts["request"], schema.LocalizeRequest)
+                explanation = explain(engine, query_from(document, rgb=parts["rgb"], depth=parts["depth"]))
                 request.state.span.stages(explanation.located.answer.timings)
                 return explanation_message(explanation).model_dump_json(by_alias=True).encode()
 
             return Response(await body.run(work), media_type="application/json")
 
-        return await asking(request, answer)
+        return await runner(request, answer)
 
     return router

@@ -12,7 +12,7 @@ from starlette.responses import Response
 from service.contract import schema
 from service.contract.convert import answer_from, fields_under, parsed, query_from, sequence_from
 from service.errors import StreetfixError
-from service.http.body import MOST_PARTS, Asking, Body, document_of, numbered_pictures, require_parts
+from service.http.body import MOST_PARTS, Body, RequestRunner, document_of, numbered_pictures, require_parts
 from service.http.described import LOCALIZE_BODY, numbered_body, problems
 from service.http.geopose import GEOPOSE, sure_geopose
 from service.http.problems import Problem, problem_of
@@ -20,14 +20,14 @@ from service.runtime.engine import Engine, Located
 from service.runtime.tracing import RequestSpan
 
 
-def router_for(asking: Asking) -> APIRouter:
+def router_for(runner: RequestRunner) -> APIRouter:
     """Create the routes.
 
     Args:
-        asking: reads the bodies; holds the engine.
+        runner: reads the bodies; holds the engine.
     """
     router = APIRouter(tags=["localization"])
-    engine = asking.engine
+    engine = runner.engine
 
     @router.post(
         "/v1/localize",
@@ -80,13 +80,16 @@ def router_for(asking: Asking) -> APIRouter:
         async def answer(body: Body) -> Response:
             headers = request.headers
             given = Given(
-                body, headers.get("content-type", ""), request.state.request_id, request.state.span,
+                body,
+                headers.get("content-type", ""),
+                request.state.request_id,
+                request.state.span,
                 geopose_alone=work is not _batch and wants_geopose(headers.get("accept", "")),
-            )  # fmt: skip
+            )
             media_type = GEOPOSE if given.geopose_alone else "application/json"
             return Response(await work(engine, given), media_type=media_type, headers={"Vary": "Accept"})
 
-        return await asking(request, answer)
+        return await runner(request, answer)
 
     return router
 
@@ -171,9 +174,9 @@ async def _batch(engine: Engine, given: Given) -> bytes:
         except StreetfixError as error:
             return Outcome(answer=None, problem=problem_of(error, given.request_id))
 
-    asked = await given.body.run(split)
-    engine.metrics.batched(len(asked))
-    outcomes = await asyncio.gather(*(one(number, *each) for number, each in enumerate(asked)))
+    requests = await given.body.run(split)
+    engine.metrics.batched(len(requests))
+    outcomes = await asyncio.gather(*(one(number, *each) for number, each in enumerate(requests)))
     return BatchAnswer(outcomes=list(outcomes)).model_dump_json(by_alias=True).encode()
 
 

@@ -26,8 +26,9 @@ _STREETS: dict[int | str, dict[str, Any]] = {
 
 _MOST_BYTES = 4096
 _SERVE_VERSION: dict[str, Any] = {
-    "required": True, "content": {"application/json": {"schema": {"$ref": "#/components/schemas/ServeVersion"}}},
-}  # fmt: skip
+    "required": True,
+    "content": {"application/json": {"schema": {"$ref": "#/components/schemas/ServeVersion"}}},
+}
 _COVERAGE: dict[int | str, dict[str, Any]] = {
     200: {
         "description": "A GeoJSON FeatureCollection with one MultiPolygon per map. Coordinates are longitude and latitude if the map is "

@@ -12,7 +12,7 @@ from starlette.responses import Response
 
 from service.contract.convert import answer_from, parsed
 from service.contract.oscp import GeoPoseAnswer, GeoPoseRequest, accuracy_of, query_of
-from service.http.body import Asking, Body
+from service.http.body import Body, RequestRunner
 from service.http.described import problems
 from service.http.geopose import sure_geopose
 
@@ -21,18 +21,19 @@ _COPIES = 3
 MEDIA_TYPE = "application/vnd.oscp+json;version=2.0"
 _VERSION = re.compile(r"application/vnd\.oscp\+json\s*;\s*version\s*=\s*\"?([0-9.]+)", re.IGNORECASE)
 _BODY: dict[str, Any] = {
-    "required": True, "content": {"application/json": {"schema": {"$ref": "#/components/schemas/GeoPoseRequest"}}},
-}  # fmt: skip
+    "required": True,
+    "content": {"application/json": {"schema": {"$ref": "#/components/schemas/GeoPoseRequest"}}},
+}
 
 
-def router_for(asking: Asking) -> APIRouter:
+def router_for(runner: RequestRunner) -> APIRouter:
     """Create the routes.
 
     Args:
-        asking: reads the bodies; holds the engine.
+        runner: reads the bodies; holds the engine.
     """
     router = APIRouter(tags=["geopose"])
-    engine = asking.engine
+    engine = runner.engine
 
     @router.get(
         "/geopose", operation_id="getGeoPoseStatus", summary="Tell whether the service speaks the OSCP GeoPose Protocol"
@@ -64,18 +65,20 @@ def router_for(asking: Asking) -> APIRouter:
 
         async def answer(body: Body) -> Response:
             def work() -> bytes:
-                asked = parsed(body.whole(copies=_COPIES), GeoPoseRequest)
-                located = answer_from(engine.localize(query_of(asked, map)))
+                document = parsed(body.whole(copies=_COPIES), GeoPoseRequest)
+                located = answer_from(engine.localize(query_of(document, map)))
                 geopose = sure_geopose(located)  # refuses an answer that is not LOCALIZED
-                told = GeoPoseAnswer(
-                    id=asked.id or uuid.uuid4().hex, timestamp=time.time_ns() // 1_000_000,
-                    accuracy=accuracy_of(located.require_pose().covariance), geopose=geopose,
-                )  # fmt: skip
-                return told.model_dump_json().encode()
+                envelope = GeoPoseAnswer(
+                    id=document.id or uuid.uuid4().hex,
+                    timestamp=time.time_ns() // 1_000_000,
+                    accuracy=accuracy_of(located.require_pose().covariance),
+                    geopose=geopose,
+                )
+                return envelope.model_dump_json().encode()
 
             return Response(await body.run(work), media_type=MEDIA_TYPE)
 
-        return await asking(request, answer)
+        return await runner(request, answer)
 
     return router
 

@@ -12,11 +12,19 @@ def make_predictions(T_true, T_answer=None, *, confidence=0.5, localized=True) -
     count = len(T_true)
     T_answer = T_true.copy() if T_answer is None else np.array(T_answer, np.float64)
     return Predictions(
-        T_true, T_answer, np.zeros(count, int), np.zeros(count, int), np.zeros((count, RANKED, 2)), np.zeros((count, RANKED), int),
+        T_true,
+        T_answer,
+        np.zeros(count, int),
+        np.zeros(count, int),
+        np.zeros((count, RANKED, 2)),
+        np.zeros((count, RANKED), int),
         np.where(np.broadcast_to(localized, count), "LOCALIZED", "AMBIGUOUS"),
-        np.broadcast_to(np.float64(confidence), count), np.zeros((count, len(FEATURES))),
-        np.tile(np.eye(6), (count, 1, 1)), np.zeros(count), np.zeros(count),
-    )  # fmt: skip
+        np.broadcast_to(np.float64(confidence), count),
+        np.zeros((count, len(FEATURES))),
+        np.tile(np.eye(6), (count, 1, 1)),
+        np.zeros(count),
+        np.zeros(count),
+    )
 
 
 @pytest.fixture(scope="session")

@@ -15,7 +15,7 @@ SWITCHES = [Switch("b", begun=1.0, done=2.0), Switch("c", begun=5.0, done=6.0), 
         [Named("a", 0.9, 20.0), Named("c", 0.9, 20.0)],  # a slow answer may be from any moment
     ],
 )
-def test_what_an_order_of_events_explains_is_no_disagreement(answers: list[Named]) -> None:
+def test_answers_that_an_order_of_events_explains_agree(answers: list[Named]) -> None:
     assert disagreements("a", SWITCHES, answers) == []
 
 
@@ -30,5 +30,5 @@ def test_what_an_order_of_events_explains_is_no_disagreement(answers: list[Named
         [Named("c", 5.1, 5.2), Named("b", 5.3, 5.4)],
     ],
 )
-def test_what_none_explains_is_one(answers: list[Named]) -> None:
+def test_an_unexplained_answer_is_a_disagreement(answers: list[Named]) -> None:
     assert len(disagreements("a", SWITCHES, answers)) == 1

@@ -1,4 +1,4 @@
-"""The judge of chaos: what should serve, what counts as wrong, and that damaged bundles are damaged."""
+"""Oracle of ``make chaos``: what must serve, what counts as wrong, and which bundles are damaged."""
 
 from collections.abc import Iterator
 from dataclasses import replace
@@ -75,7 +75,7 @@ def test_only_a_worker_that_started_while_a_folder_was_gone_leaves_a_choice() ->
     assert oracle.unsure(oracle.unchanged()).finals == {"id2", "id1"}
 
 
-def test_what_the_service_lists_must_have_the_newest_bundle_of_the_disk() -> None:
+def test_the_service_must_list_the_newest_bundle_on_disk() -> None:
     oracle, known = Oracle({"a": V[1], "b": V[2]}), {each.id: each for each in V}
     assert oracle.adopt("id2", {"id1", "id2"}, known) is None
     assert oracle.adopt("id1", {"id1"}, known) is not None

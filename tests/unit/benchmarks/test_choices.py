@@ -54,6 +54,6 @@ def test_choices_are_measured_in_a_watch_city():
     assert watch_plan().seed in WATCH_SEEDS
 
 
-def test_what_registration_is_measured_without_is_a_function_that_it_calls():
+def test_each_ablation_of_registration_replaces_a_function_that_it_calls():
     assert callable(getattr(measured, POINTS))
     assert f"points = {POINTS}(" in Path(measured.__file__).read_text()

@@ -1,4 +1,4 @@
-"""Running blocks: what fails is counted as such."""
+"""Code blocks of documents: a failing block counts as failed."""
 
 from pathlib import Path
 

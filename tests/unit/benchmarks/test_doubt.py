@@ -51,7 +51,7 @@ def test_no_answer_is_no_confidence_and_not_right(predictions_of):
 
 
 def test_false_accepts_are_counted_where_ninety_five_in_a_hundred_true_ones_are_accepted():
-    """True answers at 0.00 to 1.00: the level is 0.05. Two of the four outside reach it, the service accepted one."""
+    """Right answers at 0.00 to 1.00 give the level 0.05. Two of four out-of-map queries reach it, and the service accepted one."""
     report = Report("none", "none")
     confidence, right = np.arange(102) / 100, np.ones(102, bool)
     right[101], confidence[101] = False, 0.01
@@ -84,9 +84,14 @@ def test_nonsense_comes_in_five_kinds_as_often_as_asked_for(pictures):
 
 @pytest.mark.parametrize(
     ("kind", "share", "nearest_m", "furthest_m"),
-    [("indoor", (0.9, 1.0), 0.3, 20.0), ("blank_wall", (0.9, 1.0), 0.5, 60.0), ("covered_lens", (0.08, 0.12), 0.15, 0.7),
-     ("sky", (0.01, 0.03), 4.5, 70.0), ("noise", (0.8, 1.0), 0.9, 50.0)],
-)  # fmt: skip
+    [
+        ("indoor", (0.9, 1.0), 0.3, 20.0),
+        ("blank_wall", (0.9, 1.0), 0.5, 60.0),
+        ("covered_lens", (0.08, 0.12), 0.15, 0.7),
+        ("sky", (0.01, 0.03), 4.5, 70.0),
+        ("noise", (0.8, 1.0), 0.9, 50.0),
+    ],
+)
 def test_each_kind_has_as_much_depth_as_it_would(pictures, kind, share, nearest_m, furthest_m):
     for query in pictures[kind]:
         measured = query.depth_m[query.depth_m > 0]
@@ -102,7 +107,7 @@ def test_the_same_seed_invents_the_same(pictures):
 
 
 def test_a_room_is_as_high_as_rooms_are(pictures):
-    """The floor lies 1.5 m below the camera, the ceiling at most 2 m above it; but for the depth's noise."""
+    """Except for depth noise, the floor is 1.5 m below the camera and the ceiling at most 2 m above it."""
     for query in pictures["indoor"]:
         rays = query.camera.rays_of_pixels()
         points = rays * query.depth_m[..., None]
@@ -121,7 +126,7 @@ def test_a_stereo_rig_invents_depth_where_there_is_none_and_errs_more(pictures):
     assert roughness(stereo["blank_wall"]) > 2 * roughness(pictures["blank_wall"])
 
 
-def test_the_curve_tells_how_many_true_answers_are_left_for_each_share_of_strangers():
+def test_the_curve_gives_the_accepted_right_share_for_each_share_of_out_of_map_queries():
     confidence, right = np.array([0.9, 0.8, 0.7, 0.6]), np.array([True, True, False, True])
     points = dict(curve(confidence, right, np.array([0.85, 0.1, 0.65, 0.2])))
     assert points[0.0] == 0.25  # surer than every stranger is 0.9 alone

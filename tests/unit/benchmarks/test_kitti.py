@@ -1,4 +1,4 @@
-"""Place recognition by hand, another day's queries on a map, and which drives lie below a folder."""
+"""Place recognition with values computed by hand, queries of another day, and the drives found below a folder."""
 
 import numpy as np
 import pytest
@@ -25,9 +25,13 @@ PLACES_S = np.array([0.0, 2.0, 100.0])
 
 def found(similarity, query_xy, query_s, left_out_s):
     right, asked = found_within(
-        np.array([similarity], np.float32), np.array([query_xy]), PLACES_XY, query_s=np.array([query_s]), place_s=PLACES_S,
+        np.array([similarity], np.float32),
+        np.array([query_xy]),
+        PLACES_XY,
+        query_s=np.array([query_s]),
+        place_s=PLACES_S,
         left_out_s=left_out_s,
-    )  # fmt: skip
+    )
     return bool(right[0]), bool(asked[0])
 
 
@@ -44,7 +48,7 @@ def test_the_most_similar_place_that_counts_must_be_near(similarity, left_out_s,
 
 
 def test_a_place_of_the_same_moment_does_not_count_but_one_of_another_time_does():
-    """The query came back after 100 s to where it was at 0 s."""
+    """After 100 s the query is at the place where it was at 0 s."""
     assert found([0.9, 0.2, 0.95], [1.0, 0.0], 100.0, 60.0) == (True, True)
 
 
@@ -52,7 +56,7 @@ KARLSRUHE = {"latitude_deg": 49.0, "longitude_deg": 8.4, "height_m": 110.0}
 
 
 def dataset_at(folder, *, north_deg=0.0, up_m=0.0, query_xyz=(), is_georeferenced=True):
-    """A dataset whose origin lies north of Karlsruhe's and above it. Its images are never decoded."""
+    """Make a dataset with its origin north of Karlsruhe's and above it. Its images are never decoded."""
     queries = folder / "queries" / bench.QUERIES
     for kind, end in (("rgb", "jpg"), ("depth", "png")):
         (queries / kind).mkdir(parents=True)
@@ -63,10 +67,15 @@ def dataset_at(folder, *, north_deg=0.0, up_m=0.0, query_xyz=(), is_georeference
         write_tum(queries / "poses.txt", np.arange(float(len(poses))), np.stack(poses))
     at = {"latitude_deg": KARLSRUHE["latitude_deg"] + north_deg, "height_m": KARLSRUHE["height_m"] + up_m}
     camera = CameraSensor(name="front", width=64, height=48, fx=32, fy=32, cx=31.5, cy=23.5)
-    write_description(folder, DatasetDescription(
-        name=folder.name, source={"kind": "test"}, sensors=Sensors(cameras=[camera]),
-        georeference=KARLSRUHE | at if is_georeferenced else None,
-    ))  # fmt: skip
+    write_description(
+        folder,
+        DatasetDescription(
+            name=folder.name,
+            source={"kind": "test"},
+            sensors=Sensors(cameras=[camera]),
+            georeference=KARLSRUHE | at if is_georeferenced else None,
+        ),
+    )
     return Dataset(folder)
 
 
@@ -92,7 +101,7 @@ def test_positions_without_a_georeference_are_refused(tmp_path, without):
 
 
 def test_queries_of_another_day_are_compared_in_the_frame_of_the_map(tmp_path, bundle_path, monkeypatch):
-    """The tiny map has places at x = 0, 10, ... 50 m on the lines y = 0 and y = 100 m. The queries' origin lies 40 m further north."""
+    """The tiny map has places at x = 0, 10, ... 50 m on the lines y = 0 and y = 100 m. The query origin is 40 m further north."""
     mapped = dataset_at(tmp_path / "mapped")
     asked = dataset_at(
         tmp_path / "asked",
@@ -133,8 +142,9 @@ def test_drives_are_found_wherever_they_lie(tmp_path):
     drive(tmp_path, f"{raw}/velodyne_points/data", f"{raw}/image_03", f"{raw}/oxts")
     found = drives_below(tmp_path)
     assert [(each.name, each.kind, each.packed) for each in found] == [
-        ("05", "kitti-odometry", False), ("2011_09_30_drive_0027", "kitti-raw", False),
-    ]  # fmt: skip
+        ("05", "kitti-odometry", False),
+        ("2011_09_30_drive_0027", "kitti-raw", False),
+    ]
     drive(tmp_path, "360/data_3d_raw/2013_05_28_drive_0000_sync/velodyne_points/data")
     drive(tmp_path, "360/data_2d_raw/2013_05_28_drive_0000_sync/image_01/data_rect")
     assert drives_below(tmp_path) == found  # no poses, nothing to measure
@@ -150,7 +160,7 @@ def test_drives_are_found_wherever_they_lie(tmp_path):
     assert not any("2011_09_30_drive_0027" in line for line in words)
 
 
-def test_a_packed_drive_is_told_apart(tmp_path):
+def test_a_packed_drive_is_recognised(tmp_path):
     raw = tmp_path / "kitti_0005/2011_09_26/2011_09_26_drive_0005_sync"
     drive(raw, "velodyne_points/data", "image_03", "oxts")
     (raw / "velodyne_points/data/0000000000.xz").touch()

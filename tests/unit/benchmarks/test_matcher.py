@@ -1,4 +1,4 @@
-"""Rows of simulated against recorded matching errors, from errors that are known."""
+"""Rows that compare simulated with real matching errors, for known errors."""
 
 import numpy as np
 import pytest
@@ -9,7 +9,7 @@ from model_training.evaluation.disparity_errors import DisparityErrors
 
 
 def errors_of(size):
-    """Ten thousand errors of one size and either sign, half of them textured; every tenth point is not matched."""
+    """Return 10,000 errors of one magnitude and both signs. Half are textured, and every tenth point has no match."""
     count = 10_000
     error = size * np.random.default_rng(0).choice([-1.0, 1.0], count)
     error[::10] = np.nan

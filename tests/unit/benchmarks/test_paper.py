@@ -34,9 +34,15 @@ def pairs_at(xy: list[list[float]], street: list[int]) -> Pairs:
     T[:, :2, 3] = xy
     empty: NDArray[np.uint8] = np.zeros((count, 0), np.uint8)
     return Pairs(
-        empty, empty.astype(np.uint16), empty.astype(np.float16), empty, np.zeros((count, 4)), T, np.array(street),
+        empty,
+        empty.astype(np.uint16),
+        empty.astype(np.float16),
+        empty,
+        np.zeros((count, 4)),
+        T,
+        np.array(street),
         PinholeCamera(224, 224, 112.0, 149.3, 111.5, 111.5),
-    )  # fmt: skip
+    )
 
 
 RUN = Run(commit="abc", dirty=False, date="2026-01-02T03:04:05+00:00", machine="a machine", command="make paper")
@@ -108,7 +114,7 @@ def test_training_times_are_those_of_one_run_in_turn_where_there_was_one(tmp_pat
     assert minutes("dual_encoder", "dual_encoder") == pytest.approx(1.0)  # was not measured in turn
 
 
-def test_ours_is_held_against_the_best_of_the_others_and_what_did_not_run_says_so(
+def test_our_bar_is_the_best_of_the_others_and_missing_methods_have_a_reason(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     report = Report("paper", "make paper", folder=tmp_path)
@@ -130,8 +136,11 @@ def test_ours_is_held_against_the_best_of_the_others_and_what_did_not_run_says_s
     assert "mean_distance_error_m" not in [k for k in rows if "bar" in rows[k] and ".same_drive." in k]
     assert rows["paper.streetfix.minutes_for_paper_images"]["bar"] == pytest.approx(10.0)
     assert rows["paper.dual_encoder.other_drive.mse_m2"] == {
-        "id": "paper.dual_encoder.other_drive.mse_m2", "value": None, "unit": "m2", "why": "not run yet",
-    }  # fmt: skip
+        "id": "paper.dual_encoder.other_drive.mse_m2",
+        "value": None,
+        "unit": "m2",
+        "why": "not run yet",
+    }
     for method in METHODS:
         for split in TESTS:
             for key in ("street_accuracy", "mean_distance_error_m", "mse_m2", "training_minutes"):
@@ -139,7 +148,7 @@ def test_ours_is_held_against_the_best_of_the_others_and_what_did_not_run_says_s
     capsys.readouterr()
 
 
-def test_what_a_method_answered_is_kept_whole(tmp_path: Path) -> None:
+def test_the_answers_of_a_method_are_kept_completely(tmp_path: Path) -> None:
     silent = replace(answers(0.5, [0, -1, 2]), xy=np.array([[1.23456, 2.0], [np.nan, np.nan], [0.0, 0.0]]))
     first = replace(result("raw_range", 0.0, [0, 1, 2]), answers={"other_drive": silent})
 
@@ -191,10 +200,10 @@ def test_our_encoder_is_shown_as_many_images_as_the_paper_s_network() -> None:
     assert config_as_paper(Size(frames=640, pairs=320)).pairs == 80
 
 
-def test_a_budget_buys_as_many_steps_as_a_pilot_says_and_a_run_that_began_keeps_its_own(
+def test_the_budget_sets_the_number_of_steps_and_a_started_run_keeps_its_number(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Steps of 0.5 s: 200 fit 100 s, less what is spared."""
+    """Steps of 0.5 s: 200 steps take 100 s, less the reserve."""
     clock = {"s": 0.0}
 
     def train(
@@ -240,8 +249,12 @@ def test_lidar_queries_of_the_paper_s_network_have_rows_of_their_own(
     }
     report = Report("paper", "make paper", folder=tmp_path)
 
-    all_rows(report, {"cnn_knn_converged": replace(result("cnn_knn_converged", 0, [0, 1, 2]), extra={"asked": asked})},
-             TESTS, dict.fromkeys(METHODS, "not run yet"))  # fmt: skip
+    all_rows(
+        report,
+        {"cnn_knn_converged": replace(result("cnn_knn_converged", 0, [0, 1, 2]), extra={"asked": asked})},
+        TESTS,
+        dict.fromkeys(METHODS, "not run yet"),
+    )
 
     rows = {row["id"]: row for row in report.rows}
     assert rows["paper.cnn_knn_converged.lidar_same_drive.street_accuracy"]["value"] == 0.5
@@ -250,14 +263,14 @@ def test_lidar_queries_of_the_paper_s_network_have_rows_of_their_own(
     capsys.readouterr()
 
 
-def test_the_page_says_what_becomes_of_the_paper_s_two_claims() -> None:
+def test_the_page_checks_the_paper_s_two_claims() -> None:
     with_pca = replace(result("cnn_knn_converged", 0, [0, 1, 2]), extra={"asked": asked_as(0.5, 0.4)})
     without = replace(result("cnn_knn_without_pca", 0, [0, 1, 2]), extra={"asked": asked_as(0.3, 0.6)})
 
     told = verdicts({"converged": with_pca, "without_pca": without})
 
     assert told[0] == (
-        "- LiDAR, same drive (30 %): K-NN beats softmax in 1 (`converged`), softmax K-NN in 1 (`without_pca`), of 2 variants."
+        "- LiDAR, same drive (30 %), 2 variants: K-NN beats softmax in 1 (`converged`). Softmax beats K-NN in 1 (`without_pca`)."
     )
     assert len(told) == len(SETS) + 1
     assert "LiDAR, same drive (30 %) 0.500 with, 0.300 without" in told[-1]

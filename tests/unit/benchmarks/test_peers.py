@@ -42,9 +42,11 @@ HTTPServer(("127.0.0.1", int(sys.argv[-1])), Handler).serve_forever()
 
 def figures(retrieval, full, p99_ms, cpu_ms=10.0):
     return Figures(
-        {"retrieval": retrieval, "full": full}, {"retrieval": [cpu_ms] * len(retrieval), "full": [cpu_ms] * len(full)}, p99_ms,
+        {"retrieval": retrieval, "full": full},
+        {"retrieval": [cpu_ms] * len(retrieval), "full": [cpu_ms] * len(full)},
+        p99_ms,
         asked=100 * len(p99_ms),
-    )  # fmt: skip
+    )
 
 
 def rows_of(found, failed, *, rounds=3):
@@ -58,7 +60,7 @@ def answer(*, street="broadway", x=1.0, status="LOCALIZED"):
 
 
 @pytest.mark.parametrize("name", REQUIREMENTS)
-def test_what_a_peer_installs_is_pinned(name):
+def test_packages_of_a_peer_are_pinned(name):
     assert all(re.fullmatch(r"[a-z-]+(\[[a-z]+\])?==\d+(\.\d+)+", each) for each in REQUIREMENTS[name])
     assert REQUIREMENTS[name][0].startswith(name)
     assert (Path(measure.__file__).parent / f"{name}_app.py").exists()
@@ -87,7 +89,7 @@ def test_an_environment_of_another_table_is_made_again(tmp_path, monkeypatch):
     assert commands == ["venv", "pip"]
 
 
-def test_a_package_that_cannot_be_installed_is_told(monkeypatch):
+def test_a_package_that_cannot_be_installed_is_reported(monkeypatch):
     def fails(command, **_):
         raise subprocess.CalledProcessError(1, command, stderr="no wheel of\n ray for this Python")
 
@@ -97,7 +99,7 @@ def test_a_package_that_cannot_be_installed_is_told(monkeypatch):
 
 
 def test_the_best_is_another_one_for_each_row():
-    """Retrieval: A has 50, the median of own/A is 60/50; full: B has 25; p99: A, of 90/100, 300/100 and 80/100 the middle one."""
+    """Retrieval: A has 50, and the median of own/A is 60/50. Full: B has 25. p99: A, the median of 90/100, 300/100 and 80/100."""
     rows = rows_of(
         {
             "streetfix": figures([60, 66, 54], [26, 26, 26], [90.0, 300.0, 80.0]),
@@ -133,7 +135,7 @@ def test_a_peer_that_never_ran_has_its_rows_with_the_reason_and_is_not_the_best(
     )
 
 
-def test_what_was_measured_before_a_peer_failed_counts_as_far_as_it_is_whole():
+def test_complete_rounds_before_the_failure_of_a_peer_count():
     rows = rows_of(
         {"streetfix": figures([60] * 3, [26] * 3, [90.0] * 3), "ray": figures([80] * 3, [30] * 2, [1.0])},
         {"ray": "it hung"},
@@ -154,10 +156,12 @@ def test_no_rows_hold_where_no_peer_ran():
 @pytest.mark.parametrize(
     ("other", "said"),
     [
-        (answer(street="elm"), "street"), (answer(status="AMBIGUOUS"), "status"), (answer(x=1.00001), "1e-05 m"),
+        (answer(street="elm"), "street"),
+        (answer(status="AMBIGUOUS"), "status"),
+        (answer(x=1.00001), "1e-05 m"),
         (answer(x=float("nan")), "nan m"),
     ],
-)  # fmt: skip
+)
 def test_another_answer_than_streetfixs_is_refused(other, said):
     with pytest.raises(PeerError, match=said):
         require_same([answer(), answer()], [answer(), other])
@@ -170,7 +174,7 @@ def test_an_answer_that_differs_by_rounding_is_the_same():
 
 @pytest.fixture
 def loaded(monkeypatch):
-    """Loads that take no time: 20 answers a second of full, 50 of retrieval, each in 30 ms; what was done, in order."""
+    """Return load runs without waiting: 20 full answers per second, 50 of retrieval, 30 ms each. Record the order of calls."""
     done = []
 
     def load(server, face, sent, how):
@@ -180,8 +184,10 @@ def loaded(monkeypatch):
             raise ExceptionGroup("load", [PeerError("it is gone")])
         summary = SimpleNamespace(
             answered_per_s={"full": 20.0, "retrieval": 50.0}[kind] / (2 if server.name == "mlserver" else 1),
-            cpu_ms_per_answer=9.0, errors={"timeout": 1} if server.name == "bentoml" else {}, inconsistent=0,
-        )  # fmt: skip
+            cpu_ms_per_answer=9.0,
+            errors={"timeout": 1} if server.name == "bentoml" else {},
+            inconsistent=0,
+        )
         shots = [
             Shot(0.0, 0.0, 9.0, 0, Reply("ok")),
             Shot(how.warm_up_s, how.warm_up_s, how.warm_up_s + 0.03, 0, Reply("ok")),
@@ -202,7 +208,7 @@ def start(name):
 SENDING: dict[str, Any] = {"full": ["full"], "retrieval": ["retrieval"]}
 
 
-def test_all_are_asked_the_same_rate_and_the_same_arrivals(loaded):
+def test_all_servers_get_the_same_rate_and_the_same_arrivals(loaded):
     failed = {}
     found, rate = measured(["streetfix", "mlserver"], start, SENDING, failed, seconds=2, rounds=2)
     assert failed == {}
@@ -211,8 +217,11 @@ def test_all_are_asked_the_same_rate_and_the_same_arrivals(loaded):
     assert found["mlserver"].p99_ms == pytest.approx([30.0] * 2)
     assert found["mlserver"].asked == 2  # the shot of the warm-up does not count
     assert [each for each in loaded if each[2]] == [
-        ("streetfix", "full", rate, 0), ("mlserver", "full", rate, 0), ("mlserver", "full", rate, 1), ("streetfix", "full", rate, 1),
-    ]  # fmt: skip
+        ("streetfix", "full", rate, 0),
+        ("mlserver", "full", rate, 0),
+        ("mlserver", "full", rate, 1),
+        ("streetfix", "full", rate, 1),
+    ]
 
 
 def test_peers_that_do_not_start_err_or_end_are_left_out_with_their_reasons(loaded):
@@ -220,9 +229,10 @@ def test_peers_that_do_not_start_err_or_end_are_left_out_with_their_reasons(load
     names = ["streetfix", "litserve", "bentoml", "mlserver", "ray"]
     found, _ = measured(names, start, SENDING, failed, seconds=2, rounds=1)
     assert failed == {
-        "litserve": "the server ended with code 2", "bentoml": "retrieval, saturated: {'timeout': 1}, 0 inconsistent answers",
+        "litserve": "the server ended with code 2",
+        "bentoml": "retrieval, saturated: {'timeout': 1}, 0 inconsistent answers",
         "ray": "it is gone",
-    }  # fmt: skip
+    }
     assert found["mlserver"].p99_ms
     assert sum(name == "bentoml" for name, *_ in loaded) == 1
 
@@ -255,7 +265,7 @@ def test_the_whole_tree_of_a_peer_is_stopped():
     assert not any(running(pid) for pid in tree)
 
 
-def test_a_peer_that_ends_says_its_last_words():
+def test_a_peer_that_ends_reports_its_last_output():
     with pytest.raises(PeerError, match=r"the server ended with code 3: no such map"):
         Host([sys.executable, "-c", "import sys; print('no such map'); sys.exit(3)"], SENT, core=None)
 

@@ -35,7 +35,7 @@ def test_every_plan_can_be_simulated_and_every_drive_is_one_of_its_own(plan):
     assert len(set(drives)) == len(drives)
 
 
-def test_cities_are_of_seeds_that_nothing_else_uses_and_names_are_told_apart():
+def test_cities_have_their_own_seeds_and_distinct_names():
     assert {plan.seed for plan in OWN} <= set(EVALUATION_SEEDS)
     assert len({plan.seed for plan in OWN[:3]}) == 3
     names = [plan.name for plan in OWN]
@@ -51,7 +51,7 @@ def test_a_thousand_queries_of_each_unseen_city_and_both_plans_are_of_one_city()
         assert not {query.traversal for query in one.queries} & {query.traversal for query in other.queries}
 
 
-def test_large_cities_are_asked_the_same_and_differ_in_size_alone():
+def test_large_cities_get_the_same_queries_and_differ_in_size_only():
     for k in range(3):
         small, large = unseen_plan(k), large_plan(k)
         assert (small.size_m, large.size_m) == ((300.0, 400.0), (600.0, 400.0))
@@ -74,8 +74,10 @@ def test_the_repeating_street_has_room_for_its_sequences():
 
 
 def test_shares_of_several_cities_are_pooled_by_their_queries():
-    parts = [{"queries": 100, "street_queries": 10, "localized": 0.5, "street_accuracy": 1.0},
-             {"queries": 300, "street_queries": 30, "localized": 0.9, "street_accuracy": 0.5}]  # fmt: skip
+    parts = [
+        {"queries": 100, "street_queries": 10, "localized": 0.5, "street_accuracy": 1.0},
+        {"queries": 300, "street_queries": 30, "localized": 0.9, "street_accuracy": 0.5},
+    ]
     value, count, (low, high) = pooled(parts, "localized")
     assert (value, count) == (0.8, 400)
     assert low < 0.8 < high

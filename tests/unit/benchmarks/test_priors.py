@@ -13,13 +13,13 @@ def drawn(kind, count=400):
     return np.array([prior.position_m for prior in found]) - T[:2, 3]
 
 
-def test_a_right_prior_errs_by_what_it_says():
+def test_a_right_prior_has_an_error_of_its_standard_deviation():
     assert drawn("right").std(axis=0) == pytest.approx(STD_M, rel=0.15)
     assert np.abs(drawn("right").mean(axis=0)).max() < 1
 
 
 @pytest.mark.parametrize(("kind", "least", "most"), [("aside", 10, 25), ("elsewhere", 60, 120)])
-def test_a_wrong_prior_is_wrong_by_more_than_it_says(kind, least, most):
+def test_a_wrong_prior_has_an_error_beyond_its_standard_deviation(kind, least, most):
     away = np.hypot(*drawn(kind).T)
     assert least <= away.min() < away.max() <= most
     assert np.abs(drawn(kind).mean(axis=0)).max() < 0.15 * most  # in any direction

@@ -52,14 +52,14 @@ def test_code_that_was_changed_back_is_the_same(repository):
     assert ages([first], commit("service/maps/a.py", "1"), "map") == [None]
 
 
-def test_a_mark_is_taken_away_from_a_row_that_is_measured_anew(repository):
+def test_a_stale_mark_is_removed_from_a_row_that_is_measured_again(repository):
     (_, second, third), _ = repository
     row = {"id": "map", "run": "r", "stale": True}
     mark_stale("mine", [row], {"r": {"commit": second}}, third)
     assert "stale" not in row
 
 
-def test_where_git_cannot_tell_the_age_is_unknown(repository, tmp_path, monkeypatch):
+def test_without_git_the_age_is_unknown(repository, tmp_path, monkeypatch):
     (first, _, third), _ = repository
     assert ages(["0" * 40], third, "map") == ["unknown"]
     monkeypatch.setenv("PATH", "")

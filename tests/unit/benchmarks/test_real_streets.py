@@ -1,4 +1,4 @@
-"""Rows of real drives: the status applied, and forced figures beside."""
+"""Rows of real drives: figures by status, and forced figures."""
 
 from pathlib import Path
 
@@ -24,9 +24,13 @@ def test_figures_respect_the_status_and_forced_ones_stand_beside(tmp_path):
     status_rows(report, "real.d", errors, accepted, bars=(0.95, 0.02, 0.12))
     rows = rows_of(report)
     assert {name.removeprefix("real.d."): row["value"] for name, row in rows.items()} == {
-        "answered": 0.4, "answered_within_1_m": 0.2, "answered_wrong": 0.2, "median_m": 2.55, "forced_within_1_m": 0.4,
+        "answered": 0.4,
+        "answered_within_1_m": 0.2,
+        "answered_wrong": 0.2,
+        "median_m": 2.55,
+        "forced_within_1_m": 0.4,
         "forced_median_m": 2.6,
-    }  # fmt: skip
+    }
     assert not any(rows[f"real.d.{name}"]["holds"] for name in ("answered_within_1_m", "answered_wrong", "median_m"))
 
 
@@ -77,7 +81,7 @@ def test_a_prior_is_off_by_its_standard_deviation():
 
 
 def test_drives_are_pooled_by_their_queries_and_ours_must_be_higher(tmp_path):
-    """Ten queries at 0.5 and thirty at 0.1 are 0.2 in all."""
+    """Ten queries at 0.5 and thirty at 0.1 have a share of 0.2."""
     report = Report("x", "x", folder=tmp_path)
     pooled_rows(report, [(0.5, 0.2, 10), (0.1, 0.2, 30)])
     rows = rows_of(report)

@@ -33,7 +33,7 @@ def test_conditions_stand_beside_the_clear_day_with_the_stage_that_loses_most():
     assert render._conditions({"full.unseen.precise.within_1_m": 0.5}) == []
 
 
-def test_a_curve_of_each_kind_of_stranger_is_drawn(tmp_path, monkeypatch):
+def test_each_kind_of_out_of_map_query_has_a_curve(tmp_path, monkeypatch):
     monkeypatch.setattr(render, "REPORTS", tmp_path)
     points = [[0.0, 0.5], [0.01, 0.8], [0.2, 0.9]]
     picture = render._accepts("any", {"sky.precise": points, "sky.stereo": points, "noise.stereo": points})

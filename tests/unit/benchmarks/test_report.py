@@ -20,7 +20,7 @@ def row_of(report, row_id):
     return next(row for row in report.rows if row["id"] == row_id)
 
 
-def test_a_share_is_told_with_its_number_and_wilsons_interval(report):
+def test_a_share_has_its_count_and_wilson_interval(report):
     """Eight of ten: 0.4902 to 0.9433, as in the textbooks."""
     report.share("a", np.arange(10) < 8, bar=0.75)
     row = row_of(report, "a")
@@ -28,7 +28,7 @@ def test_a_share_is_told_with_its_number_and_wilsons_interval(report):
     assert row["ci95"] == pytest.approx([0.4902, 0.9433], abs=1e-4)
 
 
-def test_what_cannot_be_measured_now_keeps_the_value_of_an_earlier_run(report):
+def test_a_row_that_cannot_be_measured_keeps_the_value_of_an_earlier_run(report):
     report.row("known", 0.5, "share")
     report.write()
     again = Report("mine", "make mine again", folder=report.folder)
@@ -44,7 +44,7 @@ def test_what_cannot_be_measured_now_keeps_the_value_of_an_earlier_run(report):
     ("right", "bar", "better", "holds"),
     [(8, 0.8, "higher", True), (8, 0.81, "higher", False), (8, 0.8, "lower", True), (8, 0.79, "lower", False)],
 )
-def test_a_shares_bar_holds_where_it_is_met(report, right, bar, better, holds):
+def test_the_bar_of_a_share_holds_at_equality(report, right, bar, better, holds):
     report.share("a", np.arange(10) < right, bar=bar, better=better)
     assert row_of(report, "a")["holds"] is holds
 
@@ -94,7 +94,7 @@ def written(name="mine"):
 
 
 def made(row_id, name="mine"):
-    """The run that measured a row, as the file has it."""
+    """Return the run that measured a row, as the file has it."""
     told = written(name)
     return told["runs"][next(row["run"] for row in told["rows"] if row["id"] == row_id)]
 
@@ -104,7 +104,7 @@ def on(monkeypatch, machine):
 
 
 def test_the_rows_of_the_last_run_are_kept_with_all_that_is_known_of_that_run(report, monkeypatch):
-    """Machine, date and command of the last run once stood for rows that it had only kept."""
+    """Machine, date and command of the newest run were once assigned to rows that it had only kept."""
     on(monkeypatch, "slow")
     report._commit, report._dirty, report._date = "first", True, "2026-01-01T00:00:00+00:00"
     report.row("old", 1.0, "m")
@@ -121,8 +121,12 @@ def test_the_rows_of_the_last_run_are_kept_with_all_that_is_known_of_that_run(re
     assert {row["id"]: row["value"] for row in written()["rows"]} == {"old": 1.0, "both": 2.0, "new": 3.0}
     assert made("old") == before
     assert {name: before[name] for name in ("commit", "dirty", "date", "machine", "command")} == {
-        "commit": "first", "dirty": True, "date": "2026-01-01T00:00:00+00:00", "machine": "slow", "command": "make mine",
-    }  # fmt: skip
+        "commit": "first",
+        "dirty": True,
+        "date": "2026-01-01T00:00:00+00:00",
+        "machine": "slow",
+        "command": "make mine",
+    }
     for row_id in ("both", "new"):
         assert (made(row_id)["commit"], made(row_id)["dirty"], made(row_id)["machine"]) == ("second", False, "fast")
         assert made(row_id)["command"] == "make mine ARGS=--only"
@@ -176,7 +180,7 @@ def test_without_a_last_run_there_is_nothing_to_keep(report):
     assert (report.rows, report.notes) == ([], {})
 
 
-def test_without_keeping_them_the_rows_of_the_last_run_are_gone(report):
+def test_without_keep_others_the_rows_of_the_last_run_are_removed(report):
     report.row("old", 1.0, "m")
     report.write()
     Report("mine", "make mine").write()
@@ -184,7 +188,7 @@ def test_without_keeping_them_the_rows_of_the_last_run_are_gone(report):
 
 
 def test_parts_that_are_measured_at_once_keep_each_others_rows(report):
-    """The second one began before the first one wrote, and ends after it."""
+    """The second part begins before the first one writes, and ends after it."""
     report.row("old", 1.0, "m")
     report.write()
     first, second = Report("mine", "make mine --only a"), Report("mine", "make mine --only b")
@@ -222,7 +226,7 @@ def test_a_reason_stands_by_the_value_that_it_explains_and_by_no_other(report, m
     assert "reason" not in written()["rows"][0]
 
 
-def test_a_kept_rows_reason_is_looked_up_anew_at_every_writing(report, monkeypatch):
+def test_the_reason_of_a_kept_row_is_looked_up_at_every_write(report, monkeypatch):
     report.row("a", 0.5, "share", bar=0.99, why="of 3 minutes only")
     report.write()
     monkeypatch.setitem(WHY_MISSED, "a", Reason(0.5, "found out later"))

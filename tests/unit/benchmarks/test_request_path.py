@@ -1,4 +1,4 @@
-"""The files that a request passes before the engine: few, and named in the document."""
+"""The files that a request passes before the engine: they are few, and a document names them."""
 
 from collections.abc import Callable
 from pathlib import Path

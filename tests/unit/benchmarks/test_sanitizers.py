@@ -1,4 +1,4 @@
-"""The check of the C code under sanitizers: that a report is seen, and that nothing is skipped in silence."""
+"""The sanitizer check of the C code: it detects a report, and it never skips a part silently."""
 
 import re
 import shutil
@@ -45,18 +45,18 @@ def test_a_defect_is_reported(tmp_path: Path, defect: str) -> None:
 
 
 @with_sanitizers
-def test_what_fails_without_a_report_is_no_success(tmp_path: Path) -> None:
+def test_a_failure_without_a_report_is_no_success(tmp_path: Path) -> None:
     with pytest.raises(sanitizers.RunFailedError, match="a test failed"):
         sanitizers.reports_of(tmp_path, ["-c", "raise SystemExit('a test failed')"])
 
 
 @with_sanitizers
-def test_a_faultless_run_has_no_report(tmp_path: Path) -> None:
+def test_a_run_without_errors_has_no_report(tmp_path: Path) -> None:
     assert sanitizers.reports_of(tmp_path, ["-c", "print(1)"]) == []
 
 
 @pytest.mark.parametrize(("ci", "code"), [("true", 1), ("", 0)])
-def test_without_sanitizers_it_is_said_and_fails_where_checks_must_run(monkeypatch, capsys, ci: str, code: int) -> None:
+def test_without_sanitizers_a_line_says_so_and_required_checks_fail(monkeypatch, capsys, ci: str, code: int) -> None:
     monkeypatch.setattr(shutil, "which", lambda _name: None)
     monkeypatch.setenv("CI", ci)
     with pytest.raises(SystemExit) as left:

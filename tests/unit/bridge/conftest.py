@@ -16,23 +16,33 @@ def header_of(stamp_ns: int, frame_id: str = "optical") -> SimpleNamespace:
 
 
 def image(picture: Any, encoding: str, stamp_ns: int = 0, **changed: Any) -> Any:
-    """sensor_msgs/Image of an array, without padding; anything with ROS' fields will do."""
+    """Return a sensor_msgs/Image of an array without padding. Any object with the fields of the ROS message will do."""
     height, width = picture.shape[:2]
     data = np.ascontiguousarray(picture).tobytes()
     fields = {
-        "header": header_of(stamp_ns), "height": height, "width": width, "encoding": encoding,
-        "is_bigendian": 0, "step": len(data) // height, "data": data,
-    }  # fmt: skip
+        "header": header_of(stamp_ns),
+        "height": height,
+        "width": width,
+        "encoding": encoding,
+        "is_bigendian": 0,
+        "step": len(data) // height,
+        "data": data,
+    }
     return SimpleNamespace(**(fields | changed))
 
 
 def info(stamp_ns: int = 0, **changed: Any) -> Any:
-    """sensor_msgs/CameraInfo of 6 x 4 pixels."""
+    """Return a sensor_msgs/CameraInfo of 6 x 4 pixels."""
     roi = SimpleNamespace(x_offset=0, y_offset=0, width=0, height=0, do_rectify=False)
     fields = {
-        "header": header_of(stamp_ns), "height": 4, "width": 6, "d": [], "k": [3.0, 0, 2.5, 0, 3.5, 1.5, 0, 0, 1],
-        "p": [0.0] * 12, "roi": roi,
-    }  # fmt: skip
+        "header": header_of(stamp_ns),
+        "height": 4,
+        "width": 6,
+        "d": [],
+        "k": [3.0, 0, 2.5, 0, 3.5, 1.5, 0, 0, 1],
+        "p": [0.0] * 12,
+        "roi": roi,
+    }
     return SimpleNamespace(**(fields | changed))
 
 
@@ -48,14 +58,16 @@ def info_of() -> Callable[..., Any]:
 
 @pytest.fixture(scope="session")
 def answer_of(refused_of: Callable[..., dict[str, Any]]) -> Callable[..., LocalizeAnswer]:
-    """A sure answer: a camera at (10, 20, 1.5) that looks along map x; without its pose where another status is given."""
+    """Return an accepted answer: camera at (10, 20, 1.5), view along map x. With another status it has no pose."""
 
     def made(**changed: Any) -> LocalizeAnswer:
         position = {"x": 10.0, "y": 20.0, "z": 1.5}
         pose = {
-            "position": position, "orientation": {"x": -0.5, "y": 0.5, "z": -0.5, "w": 0.5}, "heading_deg": 0.0,
+            "position": position,
+            "orientation": {"x": -0.5, "y": 0.5, "z": -0.5, "w": 0.5},
+            "heading_deg": 0.0,
             "covariance": np.diag([0.01, 0.02, 0.03, 0.001, 0.002, 0.003]).reshape(-1).tolist(),
-        }  # fmt: skip
+        }
         content = {
             "status": "LOCALIZED", "confidence": 0.95, "camera_height": {"height_m": 0.31, "origin": "given"},
             "street": {"id": "s2", "name": "End", "street": "4", "section": "end", "class_index": 6, "vote": 0.5},
@@ -71,7 +83,7 @@ def answer_of(refused_of: Callable[..., dict[str, Any]]) -> Callable[..., Locali
 
 
 class Ros:
-    """As much of ROS as the node calls; ``spin_once`` does the next of ``turns``, and after the last ``no_more``."""
+    """The part of ROS that the node calls. ``spin_once`` runs the next of ``turns``, and ``no_more`` after the last one."""
 
     def __init__(self) -> None:
         self.subscriptions: dict[str, Any] = {}
@@ -98,7 +110,7 @@ class Ros:
         self.ended.append("node")
 
     def declare_parameter(self, name: str, default: object, descriptor: Any) -> Any:
-        """As rclpy: the type of the default is that of the value, so 1 is no value for 1.0."""
+        """Declare a parameter as rclpy does: the default sets the type, so 1 is invalid for 1.0."""
         value = self.given.get(name, default)
         assert type(value) is type(default), name
         self.declared[name] = SimpleNamespace(default=default, descriptor=descriptor)
@@ -142,19 +154,27 @@ def ros(monkeypatch: pytest.MonkeyPatch) -> Ros:
     )
     modules: dict[str, Any] = {
         "rclpy": SimpleNamespace(
-            init=ros.init, create_node=ros.create_node, ok=lambda: True, spin_once=ros.spin_once,
+            init=ros.init,
+            create_node=ros.create_node,
+            ok=lambda: True,
+            spin_once=ros.spin_once,
             try_shutdown=lambda: ros.ended.append("shutdown"),
         ),
-        "rclpy.qos": qos, "rclpy.signals": SimpleNamespace(SignalHandlerOptions=SimpleNamespace(NO="no handlers")),
-        "rcl_interfaces": SimpleNamespace(), "rcl_interfaces.msg": SimpleNamespace(ParameterDescriptor=SimpleNamespace),
-        "sensor_msgs": SimpleNamespace(), "sensor_msgs.msg": SimpleNamespace(Image="Image", CameraInfo="CameraInfo"),
-        "geometry_msgs": SimpleNamespace(), "geometry_msgs.msg": SimpleNamespace(PoseWithCovarianceStamped=posed_message),
+        "rclpy.qos": qos,
+        "rclpy.signals": SimpleNamespace(SignalHandlerOptions=SimpleNamespace(NO="no handlers")),
+        "rcl_interfaces": SimpleNamespace(),
+        "rcl_interfaces.msg": SimpleNamespace(ParameterDescriptor=SimpleNamespace),
+        "sensor_msgs": SimpleNamespace(),
+        "sensor_msgs.msg": SimpleNamespace(Image="Image", CameraInfo="CameraInfo"),
+        "geometry_msgs": SimpleNamespace(),
+        "geometry_msgs.msg": SimpleNamespace(PoseWithCovarianceStamped=posed_message),
         "diagnostic_msgs": SimpleNamespace(),
         "diagnostic_msgs.msg": SimpleNamespace(
             DiagnosticArray=lambda: SimpleNamespace(header=SimpleNamespace(stamp=None), status=[]),
-            DiagnosticStatus=SimpleNamespace, KeyValue=SimpleNamespace,
+            DiagnosticStatus=SimpleNamespace,
+            KeyValue=SimpleNamespace,
         ),
-    }  # fmt: skip
+    }
     for name, content in modules.items():
         module = ModuleType(name)
         module.__dict__.update(vars(content))

@@ -17,7 +17,7 @@ Answer = Callable[..., LocalizeAnswer]
 
 
 class Robot:
-    """A bridge, its clock, and pictures for it; each answer takes half a second."""
+    """A bridge with its clock and images. Each answer takes half a second."""
 
     def __init__(self, image_of: Make, info_of: Make, answer_of: Answer) -> None:
         self.now_s = 50.0
@@ -66,18 +66,28 @@ def test_diagnoses_carry_what_an_operator_looks_for(robot: Robot) -> None:
     published = bridge.step()
     assert published is not None
     assert dict(published.diagnosis.values) == {
-        "status": "LOCALIZED", "confidence": "0.950", "street": "End", "map": "tiny@abc",
-        "camera_height": "0.31 m, given", "calibration": "unknown", "latency_ms": "500", "asked": "1", "answered": "1",
-        "published": "1", "failed": "0", "dropped": "0", "rate_hz": "0.00",
-    }  # fmt: skip
+        "status": "LOCALIZED",
+        "confidence": "0.950",
+        "street": "End",
+        "map": "tiny@abc",
+        "camera_height": "0.31 m, given",
+        "calibration": "unknown",
+        "latency_ms": "500",
+        "queries": "1",
+        "answered": "1",
+        "published": "1",
+        "failed": "0",
+        "dropped": "0",
+        "rate_hz": "0.00",
+    }
 
 
-def test_nothing_is_asked_without_a_pair(robot: Robot) -> None:
+def test_no_query_is_sent_without_a_pair(robot: Robot) -> None:
     assert robot.bridge().step() is None
     assert robot.asked == []
 
 
-def test_the_rate_is_kept_and_the_newest_pair_is_asked_about(robot: Robot) -> None:
+def test_the_rate_is_limited_and_the_newest_pair_is_sent(robot: Robot) -> None:
     bridge = robot.bridge(gate=Gate(rate_hz=1.0))
     robot.see(bridge, 1 * S)
     assert bridge.step() is not None
@@ -115,12 +125,12 @@ def test_without_a_limit_every_pair_has_its_turn(robot: Robot) -> None:
         ({"confidence": None}, Gate(min_confidence=0.0), ""),
     ],
 )
-def test_only_what_passes_the_gate_goes_out_and_the_rest_is_told(
+def test_only_answers_that_pass_the_gate_are_published_and_the_rest_is_diagnosed(
     robot: Robot, answer_of: Answer, changed: dict[str, Any], gate: Gate, why: str
 ) -> None:
     robot.answer = answer_of(**changed)
     bridge = robot.bridge(gate=gate)
-    gate._asked_s = None
+    gate._last_query_s = None
     robot.see(bridge, 1 * S)
     published = bridge.step()
     assert published is not None
@@ -130,7 +140,7 @@ def test_only_what_passes_the_gate_goes_out_and_the_rest_is_told(
 
 
 @pytest.mark.parametrize("error", [UnreachableError("nobody there"), RequestError("too dark")])
-def test_a_question_that_fails_is_told_and_the_next_is_asked(robot: Robot, answer_of: Answer, error: Exception) -> None:
+def test_a_failed_query_is_reported_and_the_next_is_sent(robot: Robot, answer_of: Answer, error: Exception) -> None:
     bridge = robot.bridge(gate=Gate(rate_hz=0.0))
     robot.answer = error
     robot.see(bridge, 1 * S)
@@ -143,7 +153,7 @@ def test_a_question_that_fails_is_told_and_the_next_is_asked(robot: Robot, answe
     assert (bridge.step() or published).pose is not None
 
 
-def test_a_picture_that_is_none_is_told_with_its_topic(robot: Robot) -> None:
+def test_an_invalid_image_is_reported_with_its_topic(robot: Robot) -> None:
     bridge = robot.bridge()
     robot.see(bridge, 1 * S, encoding="bayer_rggb8")
     published = bridge.step()

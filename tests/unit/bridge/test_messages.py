@@ -1,4 +1,4 @@
-"""Messages as ROS 2 lays them out in bytes; rosbags' own definitions and writer are the oracle."""
+"""The byte layout of ROS 2 messages. The oracle is the definitions and the writer of rosbags."""
 
 from typing import Any
 
@@ -16,7 +16,7 @@ from service.bridge.ros2 import dds_name, diagnostics_message, pose_message, qos
 STORE = get_typestore(Stores.ROS2_HUMBLE)
 HEADER = messages.Header(messages.Time(1, 2), "camera")
 POSE = StampedPose(5_000_000_007, "map", np.eye(4), np.arange(36.0).reshape(6, 6))
-TOLD = Diagnosis(0, Level.WARN, "why", (("asked", "3"), ("rate_hz", "1.00")))
+TOLD = Diagnosis(0, Level.WARN, "why", (("queries", "3"), ("rate_hz", "1.00")))
 MADE: list[Any] = [
     messages.Image(HEADER, 2, 3, "rgb8", 1, 9, bytes(range(18))),
     messages.Image(),
@@ -30,13 +30,13 @@ MADE: list[Any] = [
 
 
 def ros_name(message: Any) -> str:
-    """sensor_msgs/msg/Image of sensor_msgs.msg.dds_.Image_."""
+    """Convert sensor_msgs.msg.dds_.Image_ to sensor_msgs/msg/Image."""
     package, msg, _, name = message.__idl_typename__.split(".")
     return f"{package}/{msg}/{name.removesuffix('_')}"
 
 
 @pytest.mark.parametrize("message", MADE, ids=lambda message: type(message).__name__)
-def test_ros_reads_our_bytes_as_what_was_meant(message: Any) -> None:
+def test_ros_reads_our_bytes_correctly(message: Any) -> None:
     read = STORE.deserialize_cdr(message.serialize(), ros_name(message))
     same(read, message)
 
@@ -52,7 +52,7 @@ def test_ros_own_bytes_are_ours(message: Any) -> None:
 
 
 def same(read: Any, message: Any) -> None:
-    """Field by field: a name or an order that is not ROS' would fail here."""
+    """Compare field by field. A name or an order that differs from ROS fails here."""
     for name in message.__dataclass_fields__:
         ours, theirs = getattr(message, name), getattr(read, name)
         if hasattr(ours, "__dataclass_fields__"):
@@ -91,7 +91,7 @@ def test_a_pose_is_in_the_message_as_ros_has_it() -> None:
 def test_a_diagnosis_is_in_the_message_as_ros_has_it() -> None:
     (status,) = diagnostics_message(TOLD).status
     assert (status.level, status.name, status.message) == (1, "streetfix: localization", "why")
-    assert [(value.key, value.value) for value in status.values] == [("asked", "3"), ("rate_hz", "1.00")]
+    assert [(value.key, value.value) for value in status.values] == [("queries", "3"), ("rate_hz", "1.00")]
 
 
 def test_stamps_of_today_fit() -> None:

@@ -1,4 +1,4 @@
-"""The bridge of its settings, and the event that signals set."""
+"""The bridge built from its settings, and the event that signals set."""
 
 import signal
 from dataclasses import replace
@@ -18,9 +18,18 @@ from service.geometry.camera import PinholeCamera
 
 def test_every_setting_reaches_the_bridge() -> None:
     settings = BridgeSettings(
-        color_topic="/c", depth_topic="/d", info_topic="/i", pose_topic="/p", diagnostics_topic="/g", frame="earth",
-        mount="1,2,3,0,0,0,1", rectified=True, rate=0.5, min_confidence=0.25, tolerance=0.125,
-    )  # fmt: skip
+        color_topic="/c",
+        depth_topic="/d",
+        info_topic="/i",
+        pose_topic="/p",
+        diagnostics_topic="/g",
+        frame="earth",
+        mount="1,2,3,0,0,0,1",
+        rectified=True,
+        rate=0.5,
+        min_confidence=0.25,
+        tolerance=0.125,
+    )
     with opened(settings) as bridge:
         assert bridge.topics == Topics("/c", "/d", "/i", "/p", "/g")
         assert (bridge.frame_id, bridge.rectified) == ("earth", True)

@@ -15,7 +15,7 @@ Image = Callable[..., Any]
 
 
 def filled(image_of: Image, info_of: Image, *, colors: Any, depths: Any, infos: Any = (0,), **how: Any) -> Pairs:
-    """Stamps in milliseconds."""
+    """Fill the queues; stamps are in milliseconds."""
     pairs = Pairs(**how)
     for at in infos:
         pairs.info(info_of(at * MS))
@@ -27,7 +27,7 @@ def filled(image_of: Image, info_of: Image, *, colors: Any, depths: Any, infos: 
 
 
 def stamps(pair: Pair | None) -> tuple[int, int, int] | None:
-    """Of colour, depth and calibration, milliseconds."""
+    """Return the stamps of colour, depth and calibration, milliseconds."""
     if pair is None:
         return None
     color, depth, info = (nanoseconds_of(each) // MS for each in (pair.color, pair.depth, pair.info))
@@ -110,6 +110,6 @@ def test_every_picture_is_waiting_used_or_dropped(
     ("wrong", "name"),
     [({"tolerance_s": -1.0}, "tolerance"), ({"tolerance_s": float("nan")}, "tolerance"), ({"most": 0}, "queue")],
 )
-def test_what_is_no_setting_is_refused(wrong: dict[str, Any], name: str) -> None:
+def test_an_unknown_setting_is_refused(wrong: dict[str, Any], name: str) -> None:
     with pytest.raises(RequestError, match=f"^{name}: "):
         Pairs(**wrong)

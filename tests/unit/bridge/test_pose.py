@@ -32,8 +32,8 @@ def test_the_vehicles_origin_lies_behind_and_below_its_camera(answer_of: Answer)
     np.testing.assert_allclose(pose.T_map_vehicle[:3, 3], [8.0, 20.0, 0.3], atol=1e-12)
 
 
-def test_an_uncertain_heading_moves_what_lies_behind_the_camera_aside(answer_of: Answer) -> None:
-    """Two metres behind, 0.003 rad^2 of heading: 4 x 0.003 m^2 across, and heading and y then err against each other."""
+def test_an_uncertain_heading_adds_lateral_uncertainty_behind_the_camera(answer_of: Answer) -> None:
+    """Lever arm 2 m, heading variance 0.003 rad^2: 4 x 0.003 m^2 across, and heading and y are negatively correlated."""
     mount = transform_from(R_BODY_OPTICAL, np.array([2.0, 0.0, 0.0]))
     C = pose_of(answer_of(), mount, stamp_ns=0, frame_id="map").covariance
     np.testing.assert_allclose(C[1, 1], 0.02 + 4 * 0.003)
@@ -42,7 +42,7 @@ def test_an_uncertain_heading_moves_what_lies_behind_the_camera_aside(answer_of:
     np.testing.assert_allclose(C[0, 0], 0.01)
 
 
-def test_an_answer_without_covariance_is_told_as_a_wide_one(answer_of: Answer) -> None:
+def test_an_answer_without_covariance_gets_a_wide_one(answer_of: Answer) -> None:
     whole = answer_of().pose
     assert whole is not None
     pose = whole.model_copy(update={"covariance": None})
@@ -85,6 +85,6 @@ def test_a_mount_is_what_tf2_prints() -> None:
 
 
 @pytest.mark.parametrize("text", ["", "1,2,3", "1,2,3,0,0,0,0", "1,2,3,0,0,0,2", "a,0,0,0,0,0,1", "nan,0,0,0,0,0,1"])
-def test_what_is_no_mount_is_refused_with_an_example(text: Any) -> None:
+def test_an_invalid_mount_is_refused_with_an_example(text: Any) -> None:
     with pytest.raises(RequestError, match=r"--mount: .*such as 0\.2,0,0\.5"):
         mount_from(text)

@@ -1,4 +1,4 @@
-"""The node of rclpy with rclpy's part played: what it subscribes to, publishes, and how it ends."""
+"""The rclpy node with a fake rclpy: its subscriptions, its publishers, and how it ends."""
 
 from collections.abc import Callable
 from threading import Event
@@ -35,7 +35,7 @@ def test_pictures_in_a_pose_and_a_diagnosis_out(
     assert len(pose.pose.covariance) == 36
     (array,) = ros.published["/diagnostics"]
     assert (array.header.stamp, array.status[0].level) == ("now", b"\x00")
-    assert {"asked", "rate_hz"} < {value.key for value in array.status[0].values}
+    assert {"queries", "rate_hz"} < {value.key for value in array.status[0].values}
     assert len(told) == 1
     assert (ros.domain, ros.signals, ros.ended) == (3, "no handlers", ["node", "shutdown"])
 
@@ -44,13 +44,15 @@ def test_pictures_in_a_pose_and_a_diagnosis_out(
     ("reliable", "depth", "wanted"),
     [(True, 0, ("reliable", "all", 1000)), (False, 5, ("best effort", "last", 5))],
 )
-def test_pictures_are_subscribed_to_as_told(ros: Any, reliable: bool, depth: int, wanted: tuple[str, str, int]) -> None:
+def test_image_subscriptions_follow_the_settings(
+    ros: Any, reliable: bool, depth: int, wanted: tuple[str, str, int]
+) -> None:
     rclpy_node.run(Bridge(localize=lambda *_: pytest.fail("asked")), ros.over, reliable=reliable, depth=depth)
     for subscription in ros.subscriptions.values():
         assert (subscription.qos.reliability, subscription.qos.history, subscription.qos.depth) == wanted
 
 
-def test_silence_is_told_once_a_second(ros: Any) -> None:
+def test_silence_is_reported_once_per_second(ros: Any) -> None:
     now_s = [0.0]
     bridge = Bridge(localize=lambda *_: pytest.fail("asked"), gate=Gate(rate_hz=0.0), clock=lambda: now_s[0])
 
@@ -72,6 +74,6 @@ def test_the_node_is_taken_down_when_something_breaks(ros: Any) -> None:
     assert ros.ended == ["node", "shutdown"]
 
 
-def test_without_ros_the_remedy_is_told() -> None:
+def test_without_ros_the_remedy_is_reported() -> None:
     with pytest.raises(ExtraMissingError, match=r"'rclpy', which comes with ROS 2: source .*--node dds"):
         rclpy_node.run(Bridge(localize=lambda *_: pytest.fail("asked")), Event())

@@ -29,7 +29,7 @@ S = 10**9
 
 
 def imported_by(*files: Path) -> set[str]:
-    """Top-level packages that files import, also in functions or by name."""
+    """Return the top-level packages that files import, also inside functions or by name."""
     found = set[str]()
     for file in files:
         for node in ast.walk(ast.parse(file.read_text())):
@@ -52,7 +52,7 @@ def told(name: str) -> str:
 
 @pytest.fixture
 def setup_of(monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
-    """What ``setup.py`` tells setuptools."""
+    """Return the arguments that ``setup.py`` passes to setuptools."""
     given: dict[str, Any] = {}
     module = ModuleType("setuptools")
     module.__dict__["setup"] = lambda **arguments: given.update(arguments)
@@ -120,7 +120,7 @@ def test_node_and_launch_file_know_the_same_names() -> None:
 
 @pytest.fixture
 def node(ros: Any) -> dict[str, Any]:
-    """The module of the node, with rclpy's part played."""
+    """Load the module of the node with a fake rclpy."""
     return runpy.run_path(str(PACKAGE / "streetfix_ros" / "bridge.py"))
 
 
@@ -150,10 +150,15 @@ def test_the_node_answers_images_until_a_signal(
 
     monkeypatch.setattr(in_place, "InPlace", of)
     ros.given = {
-        "map": "maps/site", "pose_topic": "/pose", "frame": "earth", "mount": "0,0,0,-0.5,0.5,-0.5,0.5",
-        "base_on_ground": True, "camera_height_m": 0.3,
-        "reliable": True, "queue": 0,
-    }  # fmt: skip
+        "map": "maps/site",
+        "pose_topic": "/pose",
+        "frame": "earth",
+        "mount": "0,0,0,-0.5,0.5,-0.5,0.5",
+        "base_on_ground": True,
+        "camera_height_m": 0.3,
+        "reliable": True,
+        "queue": 0,
+    }
 
     def see() -> None:
         ros.subscriptions["/camera/color/camera_info"].heard(info_of(0))
@@ -184,7 +189,7 @@ def test_a_parameter_that_makes_no_sense_ends_the_node_with_the_remedy(ros: Any,
 
 @pytest.fixture
 def launch(monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
-    """The launch file, with the parts of launch and launch_ros played by records of their arguments."""
+    """Load the launch file with fakes of launch and launch_ros that record their arguments."""
     # An argument of the launch is a name here, and the context a mapping from names to texts.
     modules: dict[str, dict[str, Any]] = {
         "ament_index_python": {},
@@ -239,6 +244,6 @@ def test_only_arguments_that_are_given_override_the_file(launch: dict[str, Any])
         ("reliable", "yes", "reliable:=yes is not true or false; the package's file says False"),
     ],
 )
-def test_an_argument_of_another_type_is_told(launch: dict[str, Any], name: str, text: str, words: str) -> None:
+def test_an_argument_of_a_wrong_type_is_reported(launch: dict[str, Any], name: str, text: str, words: str) -> None:
     with pytest.raises(ValueError, match=words):
         launch["value_of"](name, text, parameters()[name])

@@ -1,4 +1,4 @@
-"""Settings of the bridge: one list for the options of the command and the parameters of the ROS node."""
+"""Settings of the bridge: the options of the command and the parameters of the ROS node come from one list."""
 
 import inspect
 from dataclasses import fields
@@ -43,8 +43,14 @@ def test_a_parameter_has_the_type_of_its_setting_and_an_empty_text_for_none() ->
     declared = parameters()
     assert list(declared) == NAMES
     assert [name for name, value in declared.items() if value == ""] == [
-        "map", "map_name", "api_key", "ca", "cert", "key", "mount",
-    ]  # fmt: skip
+        "map",
+        "map_name",
+        "api_key",
+        "ca",
+        "cert",
+        "key",
+        "mount",
+    ]
     assert (declared["rate"], declared["rectified"], declared["queue"]) == (1.0, False, 5)
 
 
@@ -55,8 +61,12 @@ def test_the_default_parameters_are_the_default_settings() -> None:
 def test_parameters_that_are_given_become_settings(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("HOME", "/home/robot")
     given: dict[str, str | float | int | bool] = {
-        "map": "~/maps/site", "mount": "0,0,0,0,0,0,1", "rate": 0.0, "rectified": True, "frame": "earth",
-    }  # fmt: skip
+        "map": "~/maps/site",
+        "mount": "0,0,0,0,0,0,1",
+        "rate": 0.0,
+        "rectified": True,
+        "frame": "earth",
+    }
     assert settings_from(parameters() | given, environ={}) == BridgeSettings(
         map=Path("/home/robot/maps/site"), mount="0,0,0,0,0,0,1", rate=0.0, rectified=True, frame="earth"
     )
@@ -69,5 +79,5 @@ def test_the_key_of_the_environment_stands_in_for_none(given: str, wanted: str) 
 
 
 def test_a_text_that_must_be_there_stays_empty() -> None:
-    """An empty topic is an error of ROS, not a wish for the default."""
+    """An empty topic stays empty, so ROS reports the error. It does not select the default."""
     assert settings_from(parameters() | {"color_topic": ""}, environ={}).color_topic == ""

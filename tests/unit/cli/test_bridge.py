@@ -45,7 +45,7 @@ def test_a_missing_package_names_the_extra(monkeypatch: pytest.MonkeyPatch, caps
     assert 'pip install ".[ros2]"' in capsys.readouterr().err
 
 
-def test_rclpy_without_ros_is_told(capsys: pytest.CaptureFixture[str]) -> None:
+def test_rclpy_without_ros_is_reported(capsys: pytest.CaptureFixture[str]) -> None:
     assert run("ros2", "--node", "rclpy") == 1
     assert "source /opt/ros/DISTRIBUTION/setup.bash" in capsys.readouterr().err
 
@@ -61,13 +61,13 @@ def test_rclpy_without_ros_is_told(capsys: pytest.CaptureFixture[str]) -> None:
         (["--map", "m", "--map-name", "n"], "--map gives one map"),
     ],
 )
-def test_bad_options_are_told_with_what_to_write(
+def test_invalid_options_are_reported_with_the_remedy(
     capsys: pytest.CaptureFixture[str], arguments: list[str], words: str
 ) -> None:
     assert run("ros2", *arguments) == 1
     assert words in capsys.readouterr().err
 
 
-def test_a_bundle_that_is_not_there_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_missing_bundle_is_reported(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert run("ros2", "--map", str(tmp_path / "none")) == 1
     assert "none" in capsys.readouterr().err

@@ -1,4 +1,4 @@
-"""``streetfix compare`` as a person calls it."""
+"""``streetfix compare`` as a user calls it."""
 
 import json
 import shutil
@@ -15,7 +15,7 @@ SET = "drive1_precise"
 
 @pytest.fixture
 def moved(saved_run: Path, tmp_path: Path) -> Path:
-    """The same run, but the first query is answered at the truth, the others 40 m off it, and all accepted."""
+    """Return the same run with the first query answered at the truth and the others 40 m away. All answers are accepted."""
     folder = shutil.copytree(saved_run, tmp_path / "moved")
     p = Predictions.load(folder / "answers" / f"{SET}.npz")
     p.T_answer[:] = p.T_true

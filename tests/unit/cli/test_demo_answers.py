@@ -61,7 +61,7 @@ def test_a_place_that_the_map_lacks_is_not_counted() -> None:
     assert "not in the map" in text
 
 
-def test_a_refused_question_is_wrong_and_its_problem_is_shown(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_refused_query_counts_as_wrong_and_its_problem_is_shown(monkeypatch: pytest.MonkeyPatch) -> None:
     def refuse(*_: object, **__: object) -> None:
         raise RefusedError("the service refused: No depth")
 

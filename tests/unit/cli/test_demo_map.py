@@ -1,4 +1,4 @@
-"""When the demo makes its map anew. What is simulated and built is stood in for: only when counts here."""
+"""When the demo builds its map again. Simulation and build are faked, because only the decision is tested."""
 
 import itertools
 import shutil
@@ -20,7 +20,7 @@ PLAN = CityDemo(streets=("1",), queries=5, depth="precise", seed=0)
 
 
 class Quiet:
-    """A report that writes nothing."""
+    """A report without output."""
 
     def __call__(self, stage: str, done: int, total: int, /) -> None:
         pass
@@ -33,7 +33,7 @@ quiet = Quiet()
 
 
 class Workshop:
-    """A folder for the demo, an encoder, and how many maps were built; ``interrupted`` ends a build before it is whole."""
+    """A folder for the demo, an encoder, and a count of built maps. ``interrupted`` stops a build before it is complete."""
 
     def __init__(self, folder: Path, content_of: Callable[..., BundleContent]) -> None:
         self.folder, self.encoder, self.interrupted = folder / "demo", folder / "encoder.onnx", False
@@ -82,14 +82,14 @@ def test_a_map_is_built_once(workshop: Workshop) -> None:
     assert workshop.built == 1
 
 
-def test_another_encoder_makes_the_map_anew(workshop: Workshop) -> None:
+def test_another_encoder_builds_the_map_again(workshop: Workshop) -> None:
     workshop.demo()
     workshop.encoder.write_bytes(b"another")
     workshop.demo()
     assert workshop.built == 2
 
 
-def test_another_plan_makes_the_map_anew_even_after_an_interruption(workshop: Workshop) -> None:
+def test_another_plan_builds_the_map_again_even_after_an_interruption(workshop: Workshop) -> None:
     workshop.demo()
     other = replace(PLAN, seed=1)
     workshop.forget_dataset()
@@ -102,7 +102,7 @@ def test_another_plan_makes_the_map_anew_even_after_an_interruption(workshop: Wo
     assert workshop.built == 2
 
 
-def test_another_recording_makes_the_map_anew_even_after_an_interruption(workshop: Workshop, tmp_path: Path) -> None:
+def test_another_recording_builds_the_map_again_even_after_an_interruption(workshop: Workshop, tmp_path: Path) -> None:
     recorded_demo(tmp_path / "one", workshop.folder, workshop.encoder, quiet)
     workshop.forget_dataset()
     workshop.interrupted = True
@@ -113,14 +113,14 @@ def test_another_recording_makes_the_map_anew_even_after_an_interruption(worksho
     assert workshop.built == 2
 
 
-def test_a_map_that_is_not_the_noted_one_is_made_anew(workshop: Workshop, content_of: Callable[..., Any]) -> None:
+def test_a_map_that_differs_from_the_note_is_built_again(workshop: Workshop, content_of: Callable[..., Any]) -> None:
     workshop.demo()
     write_bundle(workshop.folder / "map", content_of(seed=77), overwrite=True)
     workshop.demo()
     assert workshop.built == 2
 
 
-def test_a_damaged_note_makes_the_map_anew(workshop: Workshop) -> None:
+def test_a_damaged_note_builds_the_map_again(workshop: Workshop) -> None:
     workshop.demo()
     (workshop.folder / "map.made_from.json").write_text("{")
     workshop.demo()

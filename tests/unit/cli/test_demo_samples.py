@@ -1,4 +1,4 @@
-"""The demo's questions as sample pairs that a service reads."""
+"""The demo writes its queries as sample pairs that the service reads."""
 
 import json
 import os
@@ -25,7 +25,7 @@ def question(folder: Path, **changed: Any) -> Question:
     return Question("1", folder / "000000.jpg", folder / "000000.png", folder / "front.json", **given)
 
 
-def test_what_is_written_is_what_a_service_reads(tmp_path: Path) -> None:
+def test_a_service_reads_the_written_values(tmp_path: Path) -> None:
     (sample,) = Samples.open(
         write_samples([question(tmp_path)], tmp_path / "samples", map_name="town")
     ).by_name.values()
@@ -36,14 +36,14 @@ def test_what_is_written_is_what_a_service_reads(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("changed", [{"T_map_camera": None}, {"place": 4}])
-def test_where_the_truth_says_nothing_none_is_written(tmp_path: Path, changed: dict[str, Any]) -> None:
+def test_without_ground_truth_none_is_written(tmp_path: Path, changed: dict[str, Any]) -> None:
     (sample,) = Samples.open(
         write_samples([question(tmp_path, **changed)], tmp_path / "samples", map_name="town")
     ).by_name.values()
     assert sample.truth is None
 
 
-def test_written_again_the_old_ones_are_gone(tmp_path: Path) -> None:
+def test_a_second_write_removes_the_old_files(tmp_path: Path) -> None:
     asked = question(tmp_path)
     write_samples([asked, asked], tmp_path / "samples", map_name="town")
     write_samples([asked], tmp_path / "samples", map_name="town")
@@ -51,5 +51,5 @@ def test_written_again_the_old_ones_are_gone(tmp_path: Path) -> None:
     assert not list(tmp_path.glob(".samples*"))
 
 
-def test_without_questions_the_folder_is_empty(tmp_path: Path) -> None:
+def test_without_queries_the_folder_is_empty(tmp_path: Path) -> None:
     assert Samples.open(write_samples([], tmp_path / "samples", map_name="town")).by_name == {}

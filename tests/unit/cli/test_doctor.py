@@ -15,7 +15,7 @@ def run(*arguments):
 
 @pytest.fixture
 def free(monkeypatch):
-    """Ports that the system chooses, so that no test depends on what else runs."""
+    """Return free ports that the system chooses, so no test depends on other programs."""
     monkeypatch.setenv("STREETFIX_PORT", "0")
 
 
@@ -112,7 +112,7 @@ def test_a_setting_that_makes_no_sense_is_a_problem(capsys, monkeypatch):
 
 
 @pytest.mark.usefixtures("free")
-def test_a_library_that_does_not_load_is_told_and_the_checks_go_on(capsys, monkeypatch):
+def test_a_library_that_fails_to_load_is_reported_and_the_checks_continue(capsys, monkeypatch):
     def refuse():
         raise OSError("wrong ELF class")
 

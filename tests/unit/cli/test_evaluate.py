@@ -1,4 +1,4 @@
-"""``streetfix evaluate`` as a person calls it."""
+"""``streetfix evaluate`` as a user calls it."""
 
 import json
 import shutil
@@ -23,7 +23,7 @@ def run(*arguments: object) -> int:
 
 @pytest.fixture
 def two_sets(small_dataset: Dataset, tmp_path: Path) -> Path:
-    """The small dataset with its five queries twice, as ``drive1_precise`` and ``drive2_precise``."""
+    """Return the small dataset with its five queries twice, as ``drive1_precise`` and ``drive2_precise``."""
     folder = shutil.copytree(small_dataset.folder, tmp_path / "two")
     shutil.copytree(folder / "queries" / "drive1_precise", folder / "queries" / "drive2_precise")
     return folder
@@ -31,12 +31,16 @@ def two_sets(small_dataset: Dataset, tmp_path: Path) -> Path:
 
 @pytest.fixture
 def raw_is(monkeypatch: pytest.MonkeyPatch, small_map: Path, two_sets: Path) -> Callable[..., None]:
-    """Let the raw range image be right for those queries of both sets that are marked with a 1, by setting."""
+    """Make the raw range image correct for the queries marked with 1, for each setting."""
 
     def put(**right: str) -> None:
         xy = MapBundle.open(small_map).T_map_place[:, :2, 3]
-        truth = [f.T_map_camera[:2, 3] for name in ("drive1_precise", "drive2_precise")
-                 for f in Dataset(two_sets).queries(name) if f.T_map_camera is not None]  # fmt: skip
+        truth = [
+            f.T_map_camera[:2, 3]
+            for name in ("drive1_precise", "drive2_precise")
+            for f in Dataset(two_sets).queries(name)
+            if f.T_map_camera is not None
+        ]
         distance = np.linalg.norm(xy[None] - np.array(truth)[:, None], axis=2)
         assert distance.min(axis=1).max() < 5.0 < distance.max(axis=1).min()
         places = {
@@ -72,9 +76,16 @@ def test_a_report_folder_holds_page_answers_and_settings(
     small_dataset: Dataset, small_map: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert run("evaluate", small_map, small_dataset.folder, "--report", tmp_path / "runs" / "one") == 0
-    assert {str(path.relative_to(tmp_path / "runs" / "one")) for path in (tmp_path / "runs" / "one").rglob("*") if path.is_file()} == {
-        "index.html", "run.json", "figures.json", "answers/drive1_precise.npz",
-    }  # fmt: skip
+    assert {
+        str(path.relative_to(tmp_path / "runs" / "one"))
+        for path in (tmp_path / "runs" / "one").rglob("*")
+        if path.is_file()
+    } == {
+        "index.html",
+        "run.json",
+        "figures.json",
+        "answers/drive1_precise.npz",
+    }
     assert f"report: {tmp_path}/runs/one/index.html" in capsys.readouterr().out.replace("\n", "")
 
 

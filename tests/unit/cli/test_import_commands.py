@@ -1,4 +1,4 @@
-"""``import``, ``convert`` and ``record`` as a person calls them."""
+"""``import``, ``convert`` and ``record`` as a user calls them."""
 
 import os
 from pathlib import Path
@@ -20,7 +20,7 @@ def run(*arguments: object) -> int:
 
 @pytest.fixture
 def scans(tmp_path: Path) -> Path:
-    """Three scans in files, with poses a metre apart, one of them cut off."""
+    """Write three scan files with poses a metre apart. One file is truncated."""
     folder = tmp_path / "scans"
     folder.mkdir()
     for k in range(4):
@@ -69,7 +69,7 @@ def test_help_says_which_options_need_an_extra(capsys):
     assert "The command ignores the recording's own poses. Needs the extra odometry." in told
 
 
-def test_lines_about_pictures_are_told_only_where_pictures_are_wanted(scans, tmp_path, capsys, monkeypatch):
+def test_lines_about_images_are_printed_only_if_images_are_wanted(scans, tmp_path, capsys, monkeypatch):
     lines = Notes(("a list",), {"path": "scans"}, ("no image has stored depth",))
     monkeypatch.setattr(Clouds, "notes", lines)
     assert run("import", "clouds", scans, "--out", tmp_path / "with") == 0

@@ -43,17 +43,22 @@ ANSWER: dict[str, Any] = {
 
 #: What a refused answer has in their place.
 REFUSED: dict[str, Any] = {
-    "status": "AMBIGUOUS", "confidence": 0.3, "pose": None, "street": None,
+    "status": "AMBIGUOUS",
+    "confidence": 0.3,
+    "pose": None,
+    "street": None,
     "hypotheses": [each | {"confirmed": False} for each in ANSWER["hypotheses"]],
     "spread": {
-        "mean": {"x": 35, "y": -40, "z": 1.5}, "covariance": [9.0, 0, 0, 0, 2025.0, 0, 0, 0, 1.0], "heading_std_deg": 70.0,
+        "mean": {"x": 35, "y": -40, "z": 1.5},
+        "covariance": [9.0, 0, 0, 0, 2025.0, 0, 0, 0, 1.0],
+        "heading_std_deg": 70.0,
         "hypotheses_weight": 0.6,
     },
     "reasons": [
         {"check": "baseline", "evidence": {"log_noise": 4.25, "points": -3.5}, "remedy": "check the stereo baseline"},
         {"check": "depth", "evidence": {}, "remedy": "check [depth.scale_m]"},
     ],
-}  # fmt: skip
+}
 
 
 @pytest.fixture
@@ -65,14 +70,14 @@ def files(tmp_path: Path) -> dict[str, Any]:
 
 @pytest.fixture
 def given(files: dict[str, Any]) -> list[str]:
-    """The same as options; the camera has a focal length."""
+    """Return the command-line options of the same values. The camera has a focal length."""
     files["camera"].write_text('{"camera": {"fx": 32, "fy": 30, "cx": 31.5}}')
     return [part for name, path in files.items() for part in (f"--{name}", str(path))]
 
 
 @pytest.fixture
 def by_focal(monkeypatch: pytest.MonkeyPatch) -> Callable[..., list[dict[str, Any]]]:
-    """Answer by the fx that was asked with; the cameras are in the list."""
+    """Answer by the fx of the request. The list collects the cameras."""
 
     def put(answers: dict[float, tuple[int, dict[str, Any]]]) -> list[dict[str, Any]]:
         asked: list[dict[str, Any]] = []
@@ -106,7 +111,7 @@ def run(*arguments: str) -> int:
 
 @pytest.fixture
 def answering(monkeypatch: pytest.MonkeyPatch) -> Callable[[httpx.Response], list[dict[str, Any]]]:
-    """Answer every post with a response; what was posted is in the list."""
+    """Answer every POST with a response. The list collects the requests."""
 
     def put(response: httpx.Response) -> list[dict[str, Any]]:
         posted: list[dict[str, Any]] = []
@@ -130,7 +135,7 @@ def test_the_parts_are_posted_with_the_map_of_the_flag(files: dict[str, Any], an
     assert json.loads(posted[0]["files"]["request"][1]) == {"camera": {}, "map": "b"}
 
 
-def test_a_problem_is_told_with_field_and_request_id(files: dict[str, Any], answering: Callable[..., Any]) -> None:
+def test_a_problem_is_reported_with_field_and_request_id(files: dict[str, Any], answering: Callable[..., Any]) -> None:
     problem = {"title": "T.", "detail": "what and why", "code": "request", "field": "camera.fx", "request_id": "r1"}
     answering(httpx.Response(422, json=problem))
     with pytest.raises(RefusedError) as caught:
@@ -141,7 +146,7 @@ def test_a_problem_is_told_with_field_and_request_id(files: dict[str, Any], answ
 @pytest.mark.parametrize(
     "response", [httpx.Response(200, text="<html>"), httpx.Response(200, json=[]), httpx.Response(200, json={})]
 )
-def test_something_else_at_the_address_is_told_so(
+def test_another_server_at_the_address_is_reported(
     files: dict[str, Any], answering: Callable[..., Any], response: httpx.Response
 ) -> None:
     answering(response)
@@ -149,7 +154,7 @@ def test_something_else_at_the_address_is_told_so(
         localize("http://x", **files)
 
 
-def test_nobody_at_the_address_is_told_with_the_remedy(files: dict[str, Any]) -> None:
+def test_an_unreachable_address_is_reported_with_the_remedy(files: dict[str, Any]) -> None:
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]
     with pytest.raises(UnreachableError, match="streetfix serve BUNDLE"):
@@ -157,7 +162,7 @@ def test_nobody_at_the_address_is_told_with_the_remedy(files: dict[str, Any]) ->
 
 
 @pytest.mark.parametrize("url", ["", "localhost:8000", "http://[", "ftp://x"])
-def test_an_address_that_is_none_is_told_so(files: dict[str, Any], url: str) -> None:
+def test_an_invalid_address_is_reported(files: dict[str, Any], url: str) -> None:
     with pytest.raises(RequestError, match="pass http://HOST:PORT"):
         localize(url, **files)
 
@@ -179,7 +184,7 @@ def test_a_file_that_is_missing_is_named(files: dict[str, Any]) -> None:
         ([], None),
     ],
 )
-def test_what_is_known_beforehand_is_sent_as_the_contract_has_it(
+def test_prior_knowledge_is_sent_as_in_the_contract(
     files: dict[str, Any], answering: Callable[..., Any], flags: list[str], prior: dict[str, Any] | None
 ) -> None:
     posted = answering(httpx.Response(200, json=ANSWER))
@@ -263,7 +268,7 @@ def test_people_read_where_else_it_may_be_when_it_is_not_sure(status: str) -> No
         assert any(all(part in line for part in wanted) for line in lines[start : start + 8]), wanted
 
 
-def test_people_are_not_told_of_other_places_when_it_is_sure_or_when_there_are_none() -> None:
+def test_other_places_are_not_printed_if_the_answer_is_certain_or_there_are_none() -> None:
     assert "where it may be" not in text_of(confidence=0.999)
     assert "why" not in text_of(confidence=0.999)
     assert "where it may be" not in text_of(**REFUSED | {"hypotheses": []})
@@ -367,7 +372,7 @@ def test_no_other_focal_length_is_tried_for_a_good_answer_or_where_that_is_switc
     assert len(asked) == 1
 
 
-def test_a_focal_length_that_is_refused_is_told_and_the_answer_stands(
+def test_a_rejected_focal_length_is_reported_and_the_answer_stays(
     given: list[str], by_focal: Callable[..., Any], capsys: pytest.CaptureFixture[str]
 ) -> None:
     problem = {"title": "Too few.", "detail": "no depth", "code": "no-depth"}
@@ -378,7 +383,7 @@ def test_a_focal_length_that_is_refused_is_told_and_the_answer_stands(
     assert captured.err.startswith("streetfix: fx and fy times 0.5 could not be tried: the service refused: Too few.")
 
 
-def test_an_answer_of_an_older_service_that_has_a_pose_in_doubt_is_refused(
+def test_an_older_services_answer_with_an_uncertain_pose_is_refused(
     files: dict[str, Any], answering: Callable[..., Any]
 ) -> None:
     answering(httpx.Response(200, json=ANSWER | {"status": "OUT_OF_MAP"}))
@@ -387,7 +392,7 @@ def test_an_answer_of_an_older_service_that_has_a_pose_in_doubt_is_refused(
 
 
 def test_people_read_one_standard_deviation_of_position_and_heading() -> None:
-    """The worst of 0.1, 0.3 and 0.2 m; a hundredth of a radian is 0.57 degrees."""
+    """The largest of 0.1, 0.3 and 0.2 m; 0.01 rad is 0.57 degrees."""
     covariance = [0.0] * 36
     covariance[0], covariance[7], covariance[14], covariance[35] = 0.01, 0.09, 0.04, 1e-4
     text = text_of(pose=ANSWER["pose"] | {"covariance": covariance})
@@ -424,7 +429,7 @@ def test_a_folder_given_as_the_name_of_a_map_is_named(
         ({"height_m": 0.4, "height_std_m": 0.1}, {"camera_height_m": 0.3}, {"height_m": 0.3, "height_std_m": 0.1}),
         ({"height_m": 0.4}, {"camera_height_std_m": 0.02}, {"height_m": 0.4, "height_std_m": 0.02}),
     ],
-)  # fmt: skip
+)
 def test_the_camera_height_of_the_options_overrides_the_file(
     files: dict[str, Any], answering: Callable[..., Any], in_file: Any, given: Any, sent: Any
 ) -> None:
@@ -437,6 +442,14 @@ def test_the_camera_height_of_the_options_overrides_the_file(
 def test_a_deviation_without_a_height_is_refused(given: list[str], capsys: pytest.CaptureFixture[str]) -> None:
     assert run(*given, "--camera-height-std", "0.02") == 1
     assert "--camera-height-std: it needs a height" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("rest", [{}, REFUSED])
+def test_the_threshold_is_printed_beside_the_confidence(rest: Any) -> None:
+    out = io.StringIO()
+    stated = {"confidence": 0.75, "threshold": {"confidence": 0.9, "false_accept_rate": 0.01}}
+    print_answer(ANSWER | rest | stated, Console(file=out, width=200))
+    assert "(confidence 0.750; LOCALIZED from 0.90)" in out.getvalue()
 
 
 @pytest.mark.parametrize("rest", [{}, REFUSED])

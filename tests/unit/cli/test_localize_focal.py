@@ -1,4 +1,4 @@
-"""A focal length off by a factor of two is named, by ``localize`` of a real service and by ``evaluate``."""
+"""``localize`` and ``evaluate`` report a focal length that is wrong by a factor of two."""
 
 import json
 import re
@@ -34,7 +34,7 @@ def url(stock_map: Path) -> Iterator[str]:
 
 @pytest.fixture
 def ask(url: str, small_dataset: Dataset, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Any:
-    """What the command prints for a query of the small dataset whose camera file says another focal length than is true."""
+    """Return the output for a query of the small dataset with a camera file that has a wrong focal length."""
 
     def asked(*flags: str, focal: float, query: int) -> str:
         frame = list(small_dataset.queries("drive1_precise"))[query]
@@ -58,7 +58,7 @@ def ask(url: str, small_dataset: Dataset, tmp_path: Path, capsys: pytest.Capture
 def test_a_focal_length_off_by_a_factor_of_two_is_named_first(
     ask: Any, focal: float, factor: float, query: int
 ) -> None:
-    """Also where the wrong answer is accepted: the ground then seems to be 3 m below the camera (decision 0145)."""
+    """Also if the wrong answer is accepted: the ground then seems to be 3 m below the camera (decision 0145)."""
     lines = ask(focal=focal, query=query).splitlines()
     named = f"the focal length is probably off by a factor of two: fx and fy times {factor:g} "
     if lines[0].split()[1] == "LOCALIZED":

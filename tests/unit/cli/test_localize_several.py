@@ -1,4 +1,4 @@
-"""``streetfix localize --sequence`` and ``--batch``: the files, what is sent, and the answers of a real service."""
+"""``streetfix localize --sequence`` and ``--batch``: the files, the requests, and the answers of a real service."""
 
 import json
 import threading
@@ -43,7 +43,7 @@ def url(bundle_path: Path) -> Iterator[str]:
 
 @pytest.fixture
 def write(tmp_path: Path, parts_of: Any) -> Callable[..., str]:
-    """Write a file beside a folder with the images, one of them without depth, and return its path."""
+    """Write a file beside a folder with the images and return its path. One image has no depth."""
     folder = tmp_path / "images"
     folder.mkdir()
     parts = parts_of()
@@ -61,7 +61,7 @@ def write(tmp_path: Path, parts_of: Any) -> Callable[..., str]:
 
 @pytest.fixture
 def run(capsys: pytest.CaptureFixture[str]) -> Callable[..., tuple[int, str, str]]:
-    """The exit code and what the command writes."""
+    """Return the exit code and the output of the command."""
 
     def ran(*arguments: str) -> tuple[int, str, str]:
         capsys.readouterr()
@@ -75,7 +75,7 @@ def run(capsys: pytest.CaptureFixture[str]) -> Callable[..., tuple[int, str, str
 
 @pytest.fixture
 def answering(monkeypatch: pytest.MonkeyPatch) -> Callable[..., list[dict[str, Any]]]:
-    """Answer each post with the next response; the paths and the JSON of the posts are in the list."""
+    """Answer each POST with the next response. The list collects paths and JSON."""
 
     def put(*responses: httpx.Response) -> list[dict[str, Any]]:
         posted: list[dict[str, Any]] = []
@@ -97,9 +97,12 @@ def answering(monkeypatch: pytest.MonkeyPatch) -> Callable[..., list[dict[str, A
 def answer_of(status: str = "LOCALIZED", **changed: Any) -> dict[str, Any]:
     pose = {"position": {"x": 1.0, "y": 2.0, "z": 3.0}, "orientation": {}, "heading_deg": 90.0, "covariance": None}
     return {
-        "status": status, "confidence": 0.5, "pose": pose if status == "LOCALIZED" else None, "street": {"name": "Street 1"},
+        "status": status,
+        "confidence": 0.5,
+        "pose": pose if status == "LOCALIZED" else None,
+        "street": {"name": "Street 1"},
         "hypotheses": [{"pose": pose, "share": 1.0, "inliers": 0.5, "similarity": 0.5}],
-    } | changed  # fmt: skip
+    } | changed
 
 
 def untimed(answer: dict[str, Any]) -> dict[str, Any]:
@@ -227,7 +230,7 @@ def test_other_focal_lengths_are_tried_for_a_sequence(write: Any, run: Any, answ
     ]
 
 
-def test_what_came_before_a_refusal_is_printed(write: Any, run: Any, answering: Any) -> None:
+def test_answers_before_a_refusal_are_printed(write: Any, run: Any, answering: Any) -> None:
     outcome = {"answer": answer_of(), "problem": None}
     problem = {"title": "Not allowed.", "detail": "the key has expired", "code": "unauthorized"}
     path = write(SHARED | {"requests": [PAIR] * 9})
@@ -272,7 +275,7 @@ MOVED = {"T_odometry_camera": SAME}
         (SHARED | {"NAME": [PAIR, PAIR | {"rgb_file": "no.png"}]}, "pairs.json: NAME.1.rgb_file: "),
         (SHARED | {"NAME": [PAIR | {"depth_file": "no.png"}]}, "no.png cannot be read (No such file or directory)"),
     ],
-)  # fmt: skip
+)
 def test_a_file_that_is_incomplete_is_refused_by_field_and_nothing_is_sent(
     write: Any, run: Any, answering: Any, option: str, document: Any, told: str
 ) -> None:
@@ -289,13 +292,19 @@ def test_a_file_that_is_incomplete_is_refused_by_field_and_nothing_is_sent(
     ("frames", "told"),
     [
         ([PAIR | MOVED, PAIR], "frames.1.T_odometry_camera is missing, but other frames have it"),
-        ([PAIR | MOVED, PAIR | MOVED | {"T_reference_camera": SAME}], "frames.1.T_odometry_camera and T_reference_camera"),
+        (
+            [PAIR | MOVED, PAIR | MOVED | {"T_reference_camera": SAME}],
+            "frames.1.T_odometry_camera and T_reference_camera",
+        ),
         ([PAIR | {"T_odometry_camera": 3}], "frames.0.T_odometry_camera: expected position"),
-        ([PAIR | {"T_odometry_camera": SAME | {"position": {"x": 1, "y": 2}}}], "frames.0.T_odometry_camera: expected pos"),
+        (
+            [PAIR | {"T_odometry_camera": SAME | {"position": {"x": 1, "y": 2}}}],
+            "frames.0.T_odometry_camera: expected pos",
+        ),
         ([PAIR | {"T_odometry_camera": SAME | {"position": {"x": 1e999, "y": 2, "z": 3}}}], "expected finite numbers"),
         ([PAIR | {"T_odometry_camera": SAME | {"orientation": dict.fromkeys("xyzw", 0)}}], "and a unit quaternion"),
     ],
-)  # fmt: skip
+)
 def test_odometry_that_is_incomplete_is_refused_by_field(write: Any, frames: Any, told: str) -> None:
     path = write(SHARED | {"frames": frames})
     with pytest.raises(RequestError) as caught:
@@ -348,9 +357,10 @@ def test_the_table_of_a_batch_names_images_and_streets_in_whole_words(write: Any
     street = {"name": "Beginning of the street [east] with a long name"}
     problem = {"title": "Too few.", "detail": "no depth", "field": "requests.1.depth"}
     outcomes = [
-        {"answer": answer_of(street=street), "problem": None}, {"answer": None, "problem": problem},
+        {"answer": answer_of(street=street), "problem": None},
+        {"answer": None, "problem": problem},
         {"answer": answer_of("OUT_OF_MAP", confidence=None), "problem": None},
-    ]  # fmt: skip
+    ]
     answering(httpx.Response(200, json={"outcomes": outcomes}))
     code, out, _ = run("--batch", write(SHARED | {"requests": [PAIR] * 3}))
     rows = [line.split() for line in out.splitlines()]
@@ -359,5 +369,6 @@ def test_the_table_of_a_batch_names_images_and_streets_in_whole_words(write: Any
     assert rows[2] == ["1", "rgb.png", "refused"]
     assert rows[3] == ["2", "rgb.png", "OUT_OF_MAP"]
     assert out.splitlines()[4:] == [
-        "pair 1 (rgb.png): Too few. no depth [field requests.1.depth]", "1 of 3 pairs LOCALIZED, 1 refused",
-    ]  # fmt: skip
+        "pair 1 (rgb.png): Too few. no depth [field requests.1.depth]",
+        "1 of 3 pairs LOCALIZED, 1 refused",
+    ]

@@ -24,7 +24,7 @@ def run(*arguments: str) -> int:
 
 @pytest.fixture
 def mount(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
-    """Put commands behind the entry-point group, as an installed package would."""
+    """Register commands under the entry-point group, as an installed package does."""
 
     def put(**functions: Callable[..., None] | None) -> None:
         module = types.ModuleType("fake_commands")
@@ -96,7 +96,7 @@ def test_a_mounted_commands_own_help_is_shown(mount: Callable[..., None], capsys
 
 @pytest.fixture
 def care(mount: Callable[..., None]) -> None:
-    """A command with commands of its own."""
+    """A command with subcommands."""
     app = typer.Typer(no_args_is_help=True, help="Look after maps.")
 
     @app.command()
@@ -171,7 +171,7 @@ def test_an_error_of_ours_is_a_message_without_a_traceback(
 @pytest.mark.parametrize(
     "error", [FileNotFoundError(2, "No such file", "scans/7.bin"), OSError(28, "No space left on device")]
 )
-def test_what_the_system_refuses_is_a_line_and_no_traceback(
+def test_a_system_error_is_a_line_without_traceback(
     error: OSError, mount: Callable[..., None], capsys: pytest.CaptureFixture[str]
 ) -> None:
     def evaluate() -> None:
@@ -219,7 +219,7 @@ def test_the_service_alone_lists_what_it_has(service_alone: None, capsys: pytest
 
 
 @pytest.mark.parametrize("package", sorted(command_line._NOT_EVERYWHERE))
-def test_a_package_that_is_not_to_be_had_everywhere_is_said_to_be_so(
+def test_a_package_that_is_missing_on_some_platforms_is_reported(
     mount: Callable[..., None], capsys: pytest.CaptureFixture[str], package: str
 ) -> None:
     def simulate() -> None:
@@ -232,7 +232,7 @@ def test_a_package_that_is_not_to_be_had_everywhere_is_said_to_be_so(
     assert "pip install" in told
 
 
-def test_what_is_not_to_be_had_everywhere_is_what_has_a_marker() -> None:
+def test_packages_missing_on_some_platforms_are_those_with_a_marker() -> None:
     extras = tomllib.loads((Path(__file__).parents[3] / "pyproject.toml").read_text())["project"][
         "optional-dependencies"
     ]
@@ -243,7 +243,7 @@ def test_what_is_not_to_be_had_everywhere_is_what_has_a_marker() -> None:
 
 
 def names_of_commands(app: typer.Typer) -> Iterator[list[str]]:
-    """The command, and all commands below it, each as the words that call it."""
+    """Return the names of a command and all its subcommands."""
 
     def below(command: Any, words: list[str]) -> Iterator[list[str]]:
         yield words

@@ -1,4 +1,4 @@
-"""``simulate``, ``import``, ``build-map``, ``train`` and ``export`` as a person calls them."""
+"""``simulate``, ``import``, ``build-map``, ``train`` and ``export`` as a user calls them."""
 
 import json
 from collections.abc import Callable
@@ -49,10 +49,15 @@ def test_simulate_drives_have_their_own_occupants_and_the_track_the_surveys(simu
 
 def test_simulate_passes_every_option_on(tmp_path: Path) -> None:
     options = {
-        "--condition": ("fog", "condition"), "--parked-changed": (0.25, "parked_changed"), "--aside": (1.0, "aside_m"),
-        "--heading": (5.0, "heading_deg"), "--turn": (10.0, "turn_deg"), "--pitch": (2.0, "pitch_deg"),
-        "--blocked": (0.2, "blocked"), "--max-depth": (9.0, "max_depth_m"),
-    }  # fmt: skip
+        "--condition": ("fog", "condition"),
+        "--parked-changed": (0.25, "parked_changed"),
+        "--aside": (1.0, "aside_m"),
+        "--heading": (5.0, "heading_deg"),
+        "--turn": (10.0, "turn_deg"),
+        "--pitch": (2.0, "pitch_deg"),
+        "--blocked": (0.2, "blocked"),
+        "--max-depth": (9.0, "max_depth_m"),
+    }
     given = [str(part) for name, (value, _) in options.items() for part in (name, value)]
     more = ("--lidar", "vlp_16", "--survey-condition", "rain", "--no-survey-error", "--hfov", "70", "--queries", "1")
     assert run("simulate", "--out", tmp_path / "all", *given, *more, *SMALL) == 0
@@ -170,10 +175,12 @@ def test_a_number_out_of_bounds_is_refused_by_its_option(
     if command == "train":
         pytest.importorskip("torch", reason="needs the extra `training`")
     wanted = {
-        "simulate": ("--out", tmp_path / "out"), "build-map": (tmp_path / "in", "--out", tmp_path / "out"),
-        "evaluate": (tmp_path / "map", tmp_path / "in"), "train": ("--run", tmp_path / "out"),
+        "simulate": ("--out", tmp_path / "out"),
+        "build-map": (tmp_path / "in", "--out", tmp_path / "out"),
+        "evaluate": (tmp_path / "map", tmp_path / "in"),
+        "train": ("--run", tmp_path / "out"),
         "demo": ("--out", tmp_path / "out"),
-    }[command]  # fmt: skip
+    }[command]
     assert run(command, *wanted, option, value) == 2
     assert f"Invalid value for '{option}'" in capsys.readouterr().err
     assert list(tmp_path.iterdir()) == []
@@ -187,7 +194,7 @@ def test_a_number_out_of_bounds_is_refused_by_its_option(
         (("--camera", "50x480"), "width: "),
     ],
 )
-def test_what_is_no_number_to_simulate_with_is_one_line(
+def test_an_invalid_number_for_the_simulation_is_one_line(
     given: tuple[str, ...], message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert run("simulate", "--out", tmp_path / "no", *given) == 2

@@ -26,14 +26,14 @@ def clock():
 
 @pytest.fixture
 def told(clock):
-    """Lines into a list, kept beside them."""
+    """Collect the lines in a list."""
     written: list[str] = []
     reporter: Any = Lines(written.append, clock=clock)
     reporter.written = written
     return reporter
 
 
-def test_a_stage_tells_its_beginning_a_line_a_minute_and_its_end(told, clock):
+def test_a_stage_reports_its_start_one_line_per_minute_and_its_end(told, clock):
     for done in range(1, 1801):  # eight a second
         clock.now += 0.125
         told("places", done, 1800)
@@ -47,7 +47,7 @@ def test_a_stage_tells_its_beginning_a_line_a_minute_and_its_end(told, clock):
     ]
 
 
-def test_a_stage_that_reports_nothing_for_long_is_told_all_the_same(told, clock):
+def test_a_silent_stage_is_reported_too(told, clock):
     told("merge", 1, 4)
     clock.now += 59
     told.tick()
@@ -59,7 +59,7 @@ def test_a_stage_that_reports_nothing_for_long_is_told_all_the_same(told, clock)
     assert told.written[1:] == ["merge: 1 of 4 (25 %), 60 s elapsed"]
 
 
-def test_what_was_done_before_a_build_went_on_is_not_in_its_rate(told, clock):
+def test_work_before_a_resume_is_not_in_the_rate(told, clock):
     told("places", 900, 1000)
     clock.now += 60
     told("places", 910, 1000)
@@ -81,15 +81,16 @@ def test_a_total_that_grows_with_what_is_done_makes_no_line_each_time(told, cloc
     assert told.written == ["frames: 1, started", "frames: 499 done in 0 s"]
 
 
-def test_the_same_stage_on_something_else_begins_anew(told, clock):
+def test_the_same_stage_with_other_input_starts_again(told, clock):
     told("places", 7, 7)
     clock.now += 600
     told("places", 1, 7)
     clock.now += 60
     told("places", 4, 7)
     assert told.written[-2:] == [
-        "places: 1 of 7 (14 %), started", "places: 4 of 7 (57 %), 3 per minute, 60 s elapsed, about 60 s left",
-    ]  # fmt: skip
+        "places: 1 of 7 (14 %), started",
+        "places: 4 of 7 (57 %), 3 per minute, 60 s elapsed, about 60 s left",
+    ]
 
 
 def test_a_text_of_the_stage_stands_in_its_lines(told, clock):
@@ -100,14 +101,14 @@ def test_a_text_of_the_stage_stands_in_its_lines(told, clock):
     assert "training: 3 of 10 (30 %), loss 2.31, 2 per minute" in told.written[-1]
 
 
-def test_long_spans_are_told_in_hours(told, clock):
+def test_long_durations_are_in_hours(told, clock):
     told("training", 0, 1000)
     clock.now += 8000
     told("training", 500, 1000)
     assert told.written[-1].endswith("2 h 13 min elapsed, about 2 h 13 min left")
 
 
-def test_the_watching_thread_tells_while_the_work_is_silent_and_ends_with_it():
+def test_the_watching_thread_reports_while_the_work_is_silent_and_ends_with_it():
     seen = threading.Event()
 
     def write(line):
@@ -149,7 +150,7 @@ def test_a_terminal_gets_bars(monkeypatch):
         assert isinstance(report, progress._Bars)
 
 
-def test_a_reader_that_is_gone_does_not_stop_the_work(monkeypatch):
+def test_a_closed_reader_does_not_stop_the_work(monkeypatch):
     read, write = os.pipe()
     os.close(read)
     with os.fdopen(write, "w") as nobody:

@@ -39,7 +39,7 @@ def test_an_address_that_is_not_this_machines_is_refused(bundle_path: Path) -> N
 def test_garbage_collection_passes_over_what_was_imported_but_not_over_maps(
     bundle_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A full collection over all modules stops a service for 100 ms; a replaced map must not be kept by it."""
+    """A full collection over all modules would stop the service for 100 ms. A replaced map must still be freed."""
     frozen: list[int] = []
 
     def opening(*_: object, **__: object) -> None:
@@ -90,10 +90,8 @@ def test_check_of_an_empty_maps_folder_says_that_the_service_would_wait(
         check_only(Settings(maps=(tmp_path,), strict=True))
 
 
-def test_a_hangup_during_the_start_waits_until_there_is_somebody_to_handle_it(
-    bundle_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """By default it would end the process."""
+def test_a_sighup_during_the_start_waits_for_its_handler(bundle_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """By default, SIGHUP would end the process."""
     blocked: list[bool] = []
 
     def opening(*_: object, **__: object) -> None:

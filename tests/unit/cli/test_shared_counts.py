@@ -1,4 +1,4 @@
-"""Workers count in files whose blocks are there before they are counted in."""
+"""Shared counts: the blocks of a file are allocated before workers count in it."""
 
 import os
 import subprocess
@@ -50,7 +50,7 @@ def test_a_process_that_ended_before_it_counted_leaves_nothing(tmp_path: Path) -
     assert [path.stat().st_size for path in tmp_path.iterdir()] == [0]
 
 
-def test_without_room_nothing_is_left_and_the_reason_is_told(tmp_path: Path) -> None:
+def test_without_disk_space_nothing_is_left_and_the_reason_is_reported(tmp_path: Path) -> None:
     code = f"""
 import resource, pathlib
 from service.cli.shared_counts import RESERVED_BYTES, reserve

@@ -1,4 +1,4 @@
-"""The supervisor of workers, with workers that do next to nothing: each test runs it in a process of its own."""
+"""The supervisor of workers, with workers that do almost nothing. Each test runs it in its own process."""
 
 import os
 import random
@@ -31,14 +31,17 @@ def stay(number, ready):
 
 def run(code: str, *arguments: str) -> "subprocess.Popen[str]":
     return subprocess.Popen(
-        [sys.executable, "-c", _SUPERVISOR + textwrap.dedent(code), *arguments], stdout=subprocess.PIPE, stderr=subprocess.PIPE,
-        text=True, start_new_session=True,
-    )  # fmt: skip
+        [sys.executable, "-c", _SUPERVISOR + textwrap.dedent(code), *arguments],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+    )
 
 
 @pytest.fixture
 def started() -> Iterator[list["subprocess.Popen[str]"]]:
-    """Whatever a test leaves running is killed with its whole session."""
+    """Kill the whole session of every process that a test leaves running."""
     processes: list[subprocess.Popen[str]] = []
     yield processes
     for process in processes:
@@ -48,7 +51,7 @@ def started() -> Iterator[list["subprocess.Popen[str]"]]:
 
 
 def test_sigterm_at_any_moment_ends_the_supervisor_and_all_workers(started: list["subprocess.Popen[str]"]) -> None:
-    """Rounds within one process: each forks a supervisor and sends it SIGTERM while it forks 2 to 16 workers."""
+    """Each round forks a supervisor and sends SIGTERM while it forks 2 to 16 workers."""
     process = run(
         """
         import random, select
@@ -71,8 +74,9 @@ def test_sigterm_at_any_moment_ends_the_supervisor_and_all_workers(started: list
             assert os.waitstatus_to_exitcode(status) in (0, -signal.SIGTERM), status
             os.close(alive)
         """,
-        str(random.randrange(2**32)), "60",  # noqa: S311  # no secret
-    )  # fmt: skip
+        str(random.randrange(2**32)),  # noqa: S311  # no secret
+        "60",
+    )
     started.append(process)
     _, told = process.communicate(timeout=300)
     assert (process.returncode, told) == (0, "")
@@ -203,7 +207,7 @@ def test_a_process_that_cannot_be_forked_ends_the_others(started: list["subproce
 
 
 def test_a_worker_that_ends_again_and_again_waits_longer_each_time(started: list["subprocess.Popen[str]"]) -> None:
-    """The waits are what the supervisor asks ``select`` for; here they pass at once."""
+    """The delays are the timeouts that the supervisor passes to ``select``. Here they end at once."""
     process = run(
         """
         import itertools, select
@@ -254,7 +258,7 @@ def test_workers_end_with_a_supervisor_that_is_killed(started: list["subprocess.
 
 
 def _runs(pid: int) -> bool:
-    """Whether a process is there and no zombie."""
+    """Return whether a process exists and is no zombie."""
     try:
         return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
     except OSError:

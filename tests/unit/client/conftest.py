@@ -4,9 +4,11 @@ from typing import Any
 import pytest
 
 POSE: dict[str, Any] = {
-    "position": {"x": 1.0, "y": 2.0, "z": 3.0}, "orientation": {"x": 0.0, "y": 0.0, "z": 0.0, "w": 1.0}, "heading_deg": 90.0,
+    "position": {"x": 1.0, "y": 2.0, "z": 3.0},
+    "orientation": {"x": 0.0, "y": 0.0, "z": 0.0, "w": 1.0},
+    "heading_deg": 90.0,
     "covariance": [0.5] * 36,
-}  # fmt: skip
+}
 ANSWER: dict[str, Any] = {
     "status": "LOCALIZED",
     "confidence": 0.75,
@@ -25,5 +27,5 @@ ANSWER: dict[str, Any] = {
 
 @pytest.fixture
 def answer_json() -> Callable[..., dict[str, Any]]:
-    """A good answer as the service writes it."""
+    """Return an accepted answer as the service writes it."""
     return lambda **changed: ANSWER | changed

@@ -1,4 +1,4 @@
-"""The sync and the async client do the same; what is sent and what comes back is in the transport's hands."""
+"""The sync and the async client behave equally. A fake transport controls requests and responses."""
 
 import asyncio
 import email
@@ -34,7 +34,7 @@ Json = Callable[..., dict[str, Any]]
 
 
 class Asking:
-    """Calls a method of either client; what was waited for is in ``waited_s``."""
+    """Calls a method of either client; ``waited_s`` collects the delays."""
 
     def __init__(self, kind: str) -> None:
         self.kind = kind
@@ -64,7 +64,7 @@ def ask(request: pytest.FixtureRequest) -> Asking:
 
 
 def parts_of(request: httpx.Request) -> dict[str, bytes]:
-    """Of a multipart body, by Python's own parser of mail."""
+    """Return the parts of a multipart body, split by Python's mail parser."""
     head = f"Content-Type: {request.headers['content-type']}\r\n\r\n".encode()
     message = email.message_from_bytes(head + request.content, policy=email.policy.HTTP)
     parts: list[Any] = [part for part in message.walk() if not part.is_multipart()]
@@ -131,9 +131,18 @@ def test_the_parts_are_what_the_contract_asks_for(ask: Asking, answer_json: Json
     T = np.eye(4)
     T[:3, 3] = (1.0, 2.0, 3.0)
     answer = ask(
-        handler, "localize", RGB, DEPTH, CAMERA, given={"api_key": "k"}, map="tiny", gravity=[0.0, 1.0, 0.0], T_vehicle_camera=T,
-        prior=Prior(position=PriorPosition(x=1.0, y=2.0), heading_deg=90.0), options=Options(neighbours=3),
-    )  # fmt: skip
+        handler,
+        "localize",
+        RGB,
+        DEPTH,
+        CAMERA,
+        given={"api_key": "k"},
+        map="tiny",
+        gravity=[0.0, 1.0, 0.0],
+        T_vehicle_camera=T,
+        prior=Prior(position=PriorPosition(x=1.0, y=2.0), heading_deg=90.0),
+        options=Options(neighbours=3),
+    )
     parts = parts_of(seen[0])
     document = json.loads(parts["request"])
     assert (seen[0].method, seen[0].url.path, seen[0].headers["authorization"]) == ("POST", "/v1/localize", "Bearer k")
@@ -180,7 +189,7 @@ def test_an_answer_whose_status_and_pose_contradict_each_other_is_none(
 
 
 @pytest.mark.parametrize("kept", ["street", "vehicle_pose"])
-def test_a_refused_answer_keeps_nothing_of_what_its_best_guess_would_say(
+def test_a_refused_answer_contains_nothing_of_its_best_hypothesis(
     ask: Asking, answer_json: Json, refused_of: Json, kept: str
 ) -> None:
     was = answer_json(vehicle_pose=answer_json()["pose"])
@@ -195,7 +204,7 @@ def test_a_confirmed_hypothesis_of_a_refused_answer_is_none(ask: Asking, answer_
         ask(lambda _: httpx.Response(200, json=content), "localize", RGB, DEPTH, CAMERA)
 
 
-def test_a_vehicles_pose_that_was_not_asked_for_is_told_so(ask: Asking, answer_json: Json) -> None:
+def test_reading_a_vehicle_pose_that_was_not_requested_gives_a_clear_error(ask: Asking, answer_json: Json) -> None:
     answer = ask(lambda _: httpx.Response(200, json=answer_json()), "localize", RGB, DEPTH, CAMERA)
     with pytest.raises(RequestError, match="send T_vehicle_camera"):
         answer.require_vehicle_pose()
@@ -250,7 +259,7 @@ def test_maps_streets_and_coverage_are_read(ask: Asking) -> None:
     assert ask(handler, "coverage") == collection
 
 
-def test_a_problem_is_told_with_all_that_it_says(ask: Asking) -> None:
+def test_a_problem_is_reported_with_all_its_fields(ask: Asking) -> None:
     with pytest.raises(RefusedError) as caught:
         ask(lambda _: problem(422), "localize", RGB, DEPTH, CAMERA)
     error = caught.value
@@ -265,7 +274,7 @@ def test_a_problem_is_told_with_all_that_it_says(ask: Asking) -> None:
 
 
 @pytest.mark.parametrize("status", [400, 401, 404, 413, 415, 422, 500, 504])
-def test_what_is_refused_for_good_is_asked_once(ask: Asking, status: int) -> None:
+def test_a_permanently_refused_request_is_sent_once(ask: Asking, status: int) -> None:
     seen: list[httpx.Request] = []
 
     def handler(request: httpx.Request) -> httpx.Response:
@@ -278,7 +287,9 @@ def test_what_is_refused_for_good_is_asked_once(ask: Asking, status: int) -> Non
 
 
 @pytest.mark.parametrize("status", [429, 503])
-def test_a_service_that_is_busy_is_asked_again_when_it_said(ask: Asking, answer_json: Json, status: int) -> None:
+def test_a_request_to_a_busy_service_is_repeated_after_the_advised_time(
+    ask: Asking, answer_json: Json, status: int
+) -> None:
     responses = [
         httpx.Response(status, headers={"Retry-After": "3"}),
         problem(status),
@@ -288,7 +299,7 @@ def test_a_service_that_is_busy_is_asked_again_when_it_said(ask: Asking, answer_
     assert ask.waited_s == [3.0, 0.4]
 
 
-def test_a_service_that_stays_busy_is_told_with_its_last_advice(ask: Asking) -> None:
+def test_a_service_that_stays_busy_is_reported_with_its_last_advice(ask: Asking) -> None:
     with pytest.raises(UnavailableError) as caught:
         ask(
             lambda _: httpx.Response(503, headers={"Retry-After": "1"}),
@@ -320,7 +331,7 @@ def test_pictures_are_sent_again_whole(ask: Asking, answer_json: Json) -> None:
     ],
 )
 @pytest.mark.parametrize("method", ["maps", "coverage"])
-def test_something_else_at_the_address_is_told_so(
+def test_another_server_at_the_address_is_reported(
     ask: Asking, method: str, status: int, content: dict[str, Any]
 ) -> None:
     with pytest.raises(ForeignServiceError, match="not Streetfix"):
@@ -352,12 +363,15 @@ def test_every_exception_of_httpx_is_one_of_ours(kind: type[Exception]) -> None:
 @pytest.mark.parametrize(
     ("raised", "kind", "waits"),
     [
-        (httpx.ConnectError("refused"), UnreachableError, 3), (httpx.ReadError("reset"), UnreachableError, 3),
-        (httpx.ConnectTimeout("slow"), UnreachableError, 3), (httpx.ReadTimeout("slow"), NoAnswerInTimeError, 0),
-        (httpx.PoolTimeout("slow"), NoAnswerInTimeError, 0), (httpx.LocalProtocolError("bad"), RequestError, 0),
+        (httpx.ConnectError("refused"), UnreachableError, 3),
+        (httpx.ReadError("reset"), UnreachableError, 3),
+        (httpx.ConnectTimeout("slow"), UnreachableError, 3),
+        (httpx.ReadTimeout("slow"), NoAnswerInTimeError, 0),
+        (httpx.PoolTimeout("slow"), NoAnswerInTimeError, 0),
+        (httpx.LocalProtocolError("bad"), RequestError, 0),
     ],
     ids=lambda each: type(each).__name__,
-)  # fmt: skip
+)
 def test_only_a_lost_connection_is_tried_again(
     ask: Asking, raised: Exception, kind: type[Exception], waits: int
 ) -> None:
@@ -433,7 +447,7 @@ def test_pairs_of_a_batch_stand_alone(ask: Asking) -> None:
         ask(lambda _: pytest.fail("sent"), "localize_batch", frames)
 
 
-def test_nothing_to_ask_is_refused(ask: Asking) -> None:
+def test_an_empty_request_is_refused(ask: Asking) -> None:
     for method in ("localize_sequence", "localize_batch"):
         with pytest.raises(RequestError, match="at least 1 item"):
             ask(lambda _: pytest.fail("sent"), method, [])
@@ -453,13 +467,17 @@ def test_all_that_is_exported_is_there() -> None:
         (CAMERA, {"camera_height_m": 0.3}, {"height_m": 0.3}),
         (CAMERA, {"camera_height_m": 0.3, "camera_height_std_m": 0.02}, {"height_m": 0.3, "height_std_m": 0.02}),
         (SchemaCamera(width=6, height=4, fx=3, fy=3, cx=2.5, cy=1.5, height_m=0.4), {}, {"height_m": 0.4}),
-        (SchemaCamera(width=6, height=4, fx=3, fy=3, cx=2.5, cy=1.5, height_m=0.4), {"camera_height_m": 0.3}, {"height_m": 0.3}),
+        (
+            SchemaCamera(width=6, height=4, fx=3, fy=3, cx=2.5, cy=1.5, height_m=0.4),
+            {"camera_height_m": 0.3},
+            {"height_m": 0.3},
+        ),
     ],
-)  # fmt: skip
+)
 def test_a_camera_height_is_sent_only_where_it_is_known(
     ask: Asking, answer_json: Json, camera: Any, about: dict[str, Any], height: dict[str, float]
 ) -> None:
-    """An earlier service refuses fields that it does not know."""
+    """An earlier service refuses unknown fields."""
     seen: list[httpx.Request] = []
 
     def handler(request: httpx.Request) -> httpx.Response:
@@ -488,7 +506,7 @@ def test_a_vehicle_frame_on_the_ground_is_sent(ask: Asking, answer_json: Json) -
     assert [json.loads(parts_of(each)["request"])["vehicle_base_on_ground"] for each in seen] == [True, True]
 
 
-def test_an_earlier_service_tells_no_camera_height(ask: Asking, answer_json: Json) -> None:
+def test_an_earlier_service_gives_no_camera_height(ask: Asking, answer_json: Json) -> None:
     assert ask(lambda _: httpx.Response(200, json=answer_json()), "localize", RGB, DEPTH, CAMERA).camera_height is None
 
 

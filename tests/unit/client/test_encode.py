@@ -16,7 +16,7 @@ RGB = np.random.default_rng(0).integers(0, 256, (6, 8, 3)).astype(np.uint8)
 
 
 def read(depth: Any, **how: Any) -> Any:
-    """What the service makes of a depth picture, metres."""
+    """Decode a depth image as the service does, metres."""
     encoded = encode_depth(depth, **how)
     height, width = depth.shape
     camera = PinholeCamera(width, height, 10.0, 10.0, 0.0, 0.0)
@@ -48,14 +48,14 @@ def test_a_slice_of_another_picture_is_sent_as_it_looks() -> None:
 @pytest.mark.parametrize(
     "picture", [RGB[..., 0], RGB.astype(np.float32), RGB[:0], np.zeros((4, 4, 4), np.uint8), [[1]], None]
 )
-def test_what_is_no_colour_picture_is_named(picture: Any) -> None:
+def test_an_invalid_colour_image_is_named(picture: Any) -> None:
     with pytest.raises(RequestError, match=r"rgb: must be uint8 \(H, W, 3\), not .*; pass such an array") as caught:
         encode_rgb(picture)
     assert caught.value.field == "rgb"
 
 
 @pytest.mark.parametrize("quality", [0, 101, -1])
-def test_what_is_no_quality_is_refused(quality: int) -> None:
+def test_an_invalid_quality_is_refused(quality: int) -> None:
     with pytest.raises(RequestError, match=f"quality: {quality} "):
         encode_rgb(RGB, quality=quality)
 
@@ -80,7 +80,7 @@ def test_farther_measurements_take_the_finest_step_that_holds_them(farthest_m: f
     assert encode_depth(np.array([[1.0, farthest_m]], np.float32)).scale_m == pytest.approx(step_m)
 
 
-def test_what_was_not_measured_stays_so() -> None:
+def test_unmeasured_pixels_stay_unmeasured() -> None:
     depth = np.array([[np.nan, np.inf, -np.inf, -1.0, 0.0, FARTHEST_M + 1, 2.0]], np.float32)
     np.testing.assert_allclose(read(depth), [[0, 0, 0, 0, 0, 0, 2.0]])
 
@@ -100,7 +100,7 @@ def test_no_measurement_is_off_by_more_than_half_a_step(depth: Any) -> None:
 @pytest.mark.parametrize(
     "depth", [RGB, np.zeros((2, 2), np.int32), np.zeros((0, 2), np.float32), np.zeros(4, np.float32), 3.0]
 )
-def test_what_is_no_depth_picture_is_named(depth: Any) -> None:
+def test_an_invalid_depth_image_is_named(depth: Any) -> None:
     with pytest.raises(
         RequestError, match=r"depth: must be a float or uint16 array \(H, W\), not .*; pass metres"
     ) as caught:
@@ -109,7 +109,7 @@ def test_what_is_no_depth_picture_is_named(depth: Any) -> None:
 
 
 @pytest.mark.parametrize("scale_m", [0.0, -1.0, float("nan"), float("inf")])
-def test_what_is_no_scale_is_refused(scale_m: float) -> None:
+def test_an_invalid_scale_is_refused(scale_m: float) -> None:
     with pytest.raises(RequestError, match=r"depth_scale_m: .* is not a valid scale"):
         encode_depth(np.ones((2, 2), np.float32), scale_m=scale_m)
 

@@ -1,4 +1,4 @@
-"""The gRPC client against a servicer that answers as told, over a real channel; and every way a call can end."""
+"""The gRPC client against a fake servicer over a real channel, and every way a call can end."""
 
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -47,7 +47,7 @@ Json = Callable[..., dict[str, Any]]
 
 
 class Told(LocalizationServiceServicer):
-    """Answers every call with the next of ``answers``: a message, an error of the service's, or a code and words."""
+    """Answers every call with the next of ``answers``: a message, a service error, or a status code with details."""
 
     def __init__(self) -> None:
         self.answers: list[Any] = []
@@ -96,15 +96,24 @@ def client(served: tuple[Told, str], waited_s: list[float]) -> Iterator[GrpcClie
         yield client
 
 
-def test_a_request_is_what_the_service_reads_off_it(client: GrpcClient, told: Told, answer_json: Json) -> None:
+def test_a_request_is_read_by_the_service_as_written(client: GrpcClient, told: Told, answer_json: Json) -> None:
     told.answers = [answer_message(schema.LocalizeAnswer.model_validate(answer_json()))]
     T = np.eye(4)
     T[:3, 3] = (1.0, 2.0, 3.0)
     client.localize(
-        RGB, DEPTH, CAMERA, map="m", gravity=[0.0, 1.0, 0.0], T_vehicle_camera=T, options=Options(refine=False), max_range_m=40.0,
-        prior=Prior(position=PriorPosition(x=1.0, y=2.0, std_m=3.0), heading_deg=90.0), camera_height_m=0.3, camera_height_std_m=0.02,
+        RGB,
+        DEPTH,
+        CAMERA,
+        map="m",
+        gravity=[0.0, 1.0, 0.0],
+        T_vehicle_camera=T,
+        options=Options(refine=False),
+        max_range_m=40.0,
+        prior=Prior(position=PriorPosition(x=1.0, y=2.0, std_m=3.0), heading_deg=90.0),
+        camera_height_m=0.3,
+        camera_height_std_m=0.02,
         vehicle_base_on_ground=True,
-    )  # fmt: skip
+    )
     read = request_from(told.asked[0])
     assert (read.map, read.options.refine, read.depth.max_range_m, read.depth.scale_m) == ("m", False, 40.0, 0.001)
     assert read.gravity == schema.Direction(x=0, y=1, z=0)
@@ -124,16 +133,26 @@ def test_a_request_is_what_the_service_reads_off_it(client: GrpcClient, told: To
         {"status": "OUT_OF_MAP"},
         {"status": "AMBIGUOUS", "hypotheses": []},
         {"street": {"id": "s", "name": "N", "street": "1", "section": None, "class_index": 0, "vote": 1.0}},
-        {"geopose": {"position": {"lat": 52.5, "lon": 13.4, "h": 70.0}, "quaternion": {"x": 0, "y": 0, "z": 0, "w": 1}}},
+        {
+            "geopose": {
+                "position": {"lat": 52.5, "lon": 13.4, "h": 70.0},
+                "quaternion": {"x": 0, "y": 0, "z": 0, "w": 1},
+            }
+        },
         {"vehicle_pose": POSE},
         {"camera_height": {"height_m": 0.3, "origin": "given"}},
         {"calibration": "in_range"},
         {"calibration": "extrapolated", "extrapolated": {"front": 5.25, "points": -4.5}},
+        {"threshold": {"confidence": 0.9, "false_accept_rate": 0.01}},
         {"status": "AMBIGUOUS", "camera_height": {"height_m": 1.5, "origin": "assumed"}},
         {"hypotheses": [{"confirmed": True, "pose": POSE, "share": 1, "inliers": 0.5, "similarity": 0.25}]},
-        {"neighbours": [{"place": 3, "distance": 0.5, "similarity": 0.5, "street": None, "position": ORIGIN, "heading_deg": 0.0}]},
+        {
+            "neighbours": [
+                {"place": 3, "distance": 0.5, "similarity": 0.5, "street": None, "position": ORIGIN, "heading_deg": 0.0}
+            ]
+        },
     ],
-)  # fmt: skip
+)
 def test_an_answer_comes_through_the_messages_as_it_was(
     answer_json: Json, refused_of: Json, changed: dict[str, Any]
 ) -> None:
@@ -181,7 +200,7 @@ def test_maps_streets_and_coverage(client: GrpcClient, told: Told) -> None:
     [ImageSizeError("w", field="rgb"), TooLargeError("w"), UnknownMapError("w"), UnauthorizedError("w"), DeadlineError("w")],
     ids=lambda error: error.code,
 )  # fmt: skip
-def test_a_problem_is_told_and_asked_once(client: GrpcClient, told: Told, error: StreetfixError) -> None:
+def test_a_problem_is_reported_after_one_request(client: GrpcClient, told: Told, error: StreetfixError) -> None:
     told.answers = [error]
     with pytest.raises(RefusedError) as caught:
         client.maps()
@@ -191,7 +210,7 @@ def test_a_problem_is_told_and_asked_once(client: GrpcClient, told: Told, error:
 
 
 @pytest.mark.parametrize("error", [BusyError("w"), NotReadyError("w")], ids=lambda error: error.code)
-def test_what_says_when_to_come_back_is_asked_again_then(
+def test_a_refusal_with_a_retry_time_is_repeated_then(
     client: GrpcClient, told: Told, waited_s: list[float], error: StreetfixError
 ) -> None:
     told.answers = [error, error, pb.ListMapsResponse()]
@@ -199,7 +218,7 @@ def test_what_says_when_to_come_back_is_asked_again_then(
     assert waited_s == [1.0, 1.0]
 
 
-def test_what_stays_busy_is_told_so(served: tuple[Told, str], told: Told) -> None:
+def test_a_service_that_stays_busy_is_reported(served: tuple[Told, str], told: Told) -> None:
     told.answers = [BusyError("w")]
     with GrpcClient(served[1], retry=RetryPolicy(attempts=1)) as client, pytest.raises(UnavailableError) as caught:
         client.maps()
@@ -261,7 +280,7 @@ def test_an_error_that_is_no_call_is_one_of_ours() -> None:
         raise grpc.RpcError("gone")
 
 
-def test_an_answer_of_another_contract_is_told_so(client: GrpcClient, told: Told) -> None:
+def test_an_answer_of_another_contract_is_reported(client: GrpcClient, told: Told) -> None:
     told.answers = [pb.LocalizeResponse(status=99)]  # type: ignore[arg-type]  # a later contract's
     with pytest.raises(ForeignServiceError, match="another contract"):
         client.localize(RGB, DEPTH, CAMERA)

@@ -52,7 +52,7 @@ def test_a_lost_connection_is_tried_again() -> None:
 @pytest.mark.parametrize(
     "error", [RefusedError("no"), ForeignServiceError("html"), NoAnswerInTimeError("slow"), RequestError("bad")]
 )
-def test_what_would_fail_again_is_not_tried_again(error: StreetfixError) -> None:
+def test_a_permanent_failure_is_not_retried(error: StreetfixError) -> None:
     with pytest.raises(type(error)) as caught:
         attempts().wait_after(error)
     assert caught.value is error
@@ -81,7 +81,7 @@ def test_a_wait_beyond_the_budget_is_not_begun() -> None:
 
 
 @pytest.mark.parametrize("wrong", [{"attempts": 0}, {"total_s": -1.0}, {"backoff_s": float("nan")}, {"jitter": -0.1}])
-def test_what_is_no_patience_is_refused_with_its_name(wrong: dict[str, Any]) -> None:
+def test_an_invalid_patience_is_refused_by_name(wrong: dict[str, Any]) -> None:
     (name,) = wrong
     with pytest.raises(RequestError, match=f"^{name}: ") as caught:
         RetryPolicy(**wrong)

@@ -1,4 +1,4 @@
-"""Clouds and tracks as a browser is sent them."""
+"""Clouds and tracks as a browser receives them."""
 
 import struct
 from dataclasses import replace
@@ -21,7 +21,7 @@ def bundle(bundle_path: Any) -> MapBundle:
 
 
 def read(content: bytes) -> tuple[np.ndarray, np.ndarray]:
-    """Points in the map frame, and how upright each is."""
+    """Return points in the map frame, and the vertical component of each normal."""
     assert content[:4] == b"SFC1"
     count, *numbers = struct.unpack_from("<I6d", content, 4)
     records = np.frombuffer(content, RECORD, offset=56)
@@ -30,7 +30,7 @@ def read(content: bytes) -> tuple[np.ndarray, np.ndarray]:
 
 
 def a_field(side: int, tiles: int) -> tuple[np.ndarray, np.ndarray]:
-    """Flat ground, a point every 0.2 m, in tiles along x."""
+    """Return flat ground with a point every 0.2 m, in tiles along x."""
     surfels = np.zeros(tiles * side * side, SURFEL)
     x, y = np.meshgrid(np.arange(side), np.arange(side))
     for tile in range(tiles):
@@ -82,7 +82,7 @@ def test_any_beginning_is_a_thinner_cloud_of_the_whole_map() -> None:
     assert begun[:, 0].max() > 21
 
 
-def test_what_is_asked_for_is_rounded_down_to_a_level_and_kept(bundle: MapBundle) -> None:
+def test_the_requested_size_is_rounded_down_to_a_level_and_kept(bundle: MapBundle) -> None:
     clouds = Clouds()
     first = clouds.of(bundle, LEVELS[2] + 1)
     assert clouds.of(bundle, LEVELS[2] + 2) is first
@@ -110,5 +110,5 @@ def test_places_come_with_heading_and_street(bundle: MapBundle) -> None:
     assert np.array_equal(records["street"], bundle.place_street)
 
 
-def test_a_map_without_a_cloud_can_still_be_drawn(bundle: MapBundle) -> None:
+def test_a_map_without_a_cloud_can_be_drawn(bundle: MapBundle) -> None:
     assert Clouds().of(replace(bundle, cloud=None), 1000)[:4] == b"SFC1"

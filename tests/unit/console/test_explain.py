@@ -1,4 +1,4 @@
-"""Intermediate images of an answer that is known."""
+"""Intermediate images of an answer with a known pose."""
 
 import json
 from collections.abc import Callable, Iterator

@@ -1,4 +1,4 @@
-"""The console checks the focal length by the rule of ``streetfix localize``: the same numbers, the same results."""
+"""The console checks the focal length by the same rule as ``streetfix localize``, with the same results."""
 
 import json
 import shutil
@@ -67,7 +67,7 @@ def case(
 
 @pytest.fixture(scope="module")
 def results_of(tmp_path_factory: pytest.TempPathFactory) -> Results:
-    """What the page's module makes of cases, by Node."""
+    """Run the module of the page with Node and return its results."""
     if shutil.which("node") is None or not ESBUILD.exists():
         pytest.skip("the page's packages are not there: make check-console installs them, with Node")
     folder = tmp_path_factory.mktemp("page")
@@ -87,10 +87,13 @@ def results_of(tmp_path_factory: pytest.TempPathFactory) -> Results:
 
 def test_the_numbers_are_those_of_the_code() -> None:
     assert json.loads(RULE.read_text()) == {
-        "factors": list(FOCAL_FACTORS), "gain_nats": GAIN_OF_ONE, "inliers_nats": support_of(1.0, 0.0),
-        "similarity_nats": support_of(0.0, 1.0), "usual_height_m": USUAL_HEIGHT_M,
+        "factors": list(FOCAL_FACTORS),
+        "gain_nats": GAIN_OF_ONE,
+        "inliers_nats": support_of(1.0, 0.0),
+        "similarity_nats": support_of(0.0, 1.0),
+        "usual_height_m": USUAL_HEIGHT_M,
         "suspicious_ratios": [list(ratios) for ratios in SUSPICIOUS_RATIOS],
-    }, f"change {RULE} as well, then run: make console"  # fmt: skip
+    }, f"change {RULE} as well, then run: make console"
 
 
 def test_random_answers_give_the_result_of_the_command(results_of: Results, capsys: pytest.CaptureFixture[str]) -> None:
@@ -100,8 +103,11 @@ def test_random_answers_give_the_result_of_the_command(results_of: Results, caps
         status = str(rng.choice(["LOCALIZED", "AMBIGUOUS", "OUT_OF_MAP"]))
         height = (float(rng.uniform(0.3, 4.0)), str(rng.choice(["given", "estimated", "assumed"])))
         return answer_of(
-            status, inliers=rng.uniform(), similarity=rng.uniform(0.4, 0.6), height=height if rng.uniform() < 0.8 else None
-        )  # fmt: skip
+            status,
+            inliers=rng.uniform(),
+            similarity=rng.uniform(0.4, 0.6),
+            height=height if rng.uniform() < 0.8 else None,
+        )
 
     def failing() -> dict[str, Any] | None:
         return None if rng.uniform() < 0.1 else drawn()
@@ -150,7 +156,7 @@ def test_the_line_names_the_change_and_both_confidences(results_of: Results) -> 
     assert none["told"] == {"text": text, "found": False}
 
 
-def test_a_trial_that_fails_is_not_told_as_one_that_does_not_fit(results_of: Results) -> None:
+def test_a_failed_trial_differs_from_one_that_does_not_fit(results_of: Results) -> None:
     one, both = results_of(case(answer_of(), answer_of(), None), case(answer_of(), None, None))
     assert one["told"]["text"] == (
         "Focal length checked: with fx and fy halved, the images do not fit the map clearly better. "

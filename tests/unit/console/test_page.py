@@ -1,4 +1,4 @@
-"""The page that is served is the page that was built, and it asks no other host for anything."""
+"""The served page equals the built page, and it loads nothing from other hosts."""
 
 import gzip
 import re
@@ -23,7 +23,7 @@ def test_the_page_is_small() -> None:
     assert sum(len(file.compressed) for file in built_files().values()) <= 1000 * MOST_KB
 
 
-def test_what_changes_keeps_no_name_and_what_keeps_its_name_is_asked_for_again() -> None:
+def test_changed_files_get_new_names_and_others_are_revalidated() -> None:
     files = built_files()
     assert not files[INDEX].lasts
     assert all(file.lasts and re.search(r"-[\w-]{8}\.", name) for name, file in files.items() if name != INDEX)

@@ -1,4 +1,4 @@
-"""Sample pairs are read from one folder, and nothing else is."""
+"""The console reads sample pairs from one folder only."""
 
 import json
 from pathlib import Path
@@ -35,7 +35,7 @@ def test_a_pair_has_pictures_request_and_no_truth_where_there_is_none(folder: Pa
     assert samples.picture("one", "rgb").media_type == "image/jpeg"
 
 
-def test_the_truth_is_told(folder: Path) -> None:
+def test_the_ground_truth_is_written(folder: Path) -> None:
     write(folder / "two", **{"truth.json": b'{"position": {"x": 1, "y": 2, "z": 3}, "heading_deg": 90}'})
     truth = Samples.open(folder).by_name["two"].truth
     assert truth is not None

@@ -14,6 +14,7 @@ from service.errors import RequestError
 from service.geometry.rigid import R_BODY_OPTICAL, rotation_z, transform_from
 from service.imaging.level import GivenHeight
 from service.localization.localizer import Localizer
+from service.maps.calibration import Threshold
 from service.maps.reader import MapBundle
 from service.registration.register import Registered
 from service.retrieval.prior import Prior
@@ -35,7 +36,7 @@ def query_of(parts):
 
 @pytest.fixture
 def prior_of(parts_of):
-    """The prior that a request's JSON asks for, and its degrees."""
+    """Return the prior that the JSON of a request describes, and its degrees."""
 
     def made(prior):
         encoded = query_of(parts_of(prior=prior))
@@ -68,7 +69,7 @@ def test_a_camera_of_nearly_175_degrees_is_taken(camera_document):
     assert (wide.camera.fx, wide.camera.fy) == (1.28, 0.96)
 
 
-def test_a_width_that_is_refused_is_told_alone(camera_document):
+def test_a_refused_width_is_the_only_error(camera_document):
     with pytest.raises(RequestError) as caught:
         parsed(json.dumps({"camera": camera_document | {"width": 0}}).encode(), LocalizeRequest)
     assert caught.value.field == "camera.width"
@@ -99,7 +100,7 @@ def test_a_position_and_a_heading_are_taken_in_metres_and_radians(prior_of):
 
 
 @pytest.mark.parametrize("given", [{"position": {"x": 1, "y": 2}}, {"heading_deg": 0}])
-def test_what_a_prior_does_not_say_is_the_cores_default(prior_of, given):
+def test_missing_fields_of_a_prior_have_defaults(prior_of, given):
     prior, _ = prior_of(given)
     unsaid = Prior()
     assert (prior.position_std_m, prior.heading_std_rad) == pytest.approx(
@@ -128,7 +129,7 @@ def test_degrees_on_the_earth_wait_for_the_map(prior_of):
         ),
     ],
 )
-def test_a_prior_that_says_too_much_or_nothing_is_refused(prior_of, prior, message):
+def test_an_overcomplete_or_empty_prior_is_refused(prior_of, prior, message):
     with pytest.raises(RequestError) as error:
         prior_of(prior)
     assert (error.value.message, error.value.field) == (message, "prior")
@@ -157,7 +158,7 @@ def hypotheses_of(localized, *candidates, frames=1):
 
 
 def test_shares_follow_from_the_supports(localized):
-    """Supports log 5 and log 3 and log 2, whatever is added to all of them: half, three tenths, a fifth."""
+    """Supports log 5, log 3 and log 2 plus any constant give shares of 0.5, 0.3 and 0.2."""
     for added in (0.0, -700.0, 1e4):
         several = [candidate(np.log(k) + added, xyz=(100 * k, 0, 1.5)) for k in (5, 3, 2)]
         found = hypotheses_of(localized, *several)
@@ -166,13 +167,13 @@ def test_shares_follow_from_the_supports(localized):
 
 
 def test_shares_of_several_frames_are_those_that_the_status_follows_from(localized):
-    """Of four frames, whose mean has half the noise, the odds count twice: 5 : 3 is 25 : 9."""
+    """The mean of four frames has half the noise, so the odds count twice: 5 : 3 becomes 25 : 9."""
     several = [candidate(np.log(k), xyz=(100 * k, 0, 1.5)) for k in (5, 3)]
     found = hypotheses_of(localized, *several, frames=4)
     assert [each.share for each in found] == pytest.approx([25 / 34, 9 / 34])
 
 
-def test_a_hypothesis_is_told_as_it_was_registered(localized):
+def test_a_hypothesis_has_its_registered_pose(localized):
     (found,) = hypotheses_of(localized, candidate(3.0, xyz=(1, 2, 1.5), heading_deg=-90))
     assert (found.share, found.inliers, found.similarity) == (1.0, 0.7, 0.8)
     assert found.pose.heading_deg == pytest.approx(-90)
@@ -181,9 +182,14 @@ def test_a_hypothesis_is_told_as_it_was_registered(localized):
 
 
 def test_candidates_of_one_place_are_one_hypothesis_the_best_supported_of_it(localized):
-    """2.9 m and 29 degrees from the best is the same place, 2.9 m further is another: as far from the best as from its like."""
-    several = [candidate(9.0, xyz=(0, 0, 1.5)), candidate(8.9, xyz=(2.9, 0, 1.5), heading_deg=29), candidate(8.0, xyz=(5.8, 0, 1.5)),
-               candidate(7.5, xyz=(6.0, 0, 1.5)), candidate(7.0, xyz=(0, 0, 1.5), heading_deg=180)]  # fmt: skip
+    """A candidate at 2.9 m and 29 degrees is the same place. The next one, 2.9 m further, is another place."""
+    several = [
+        candidate(9.0, xyz=(0, 0, 1.5)),
+        candidate(8.9, xyz=(2.9, 0, 1.5), heading_deg=29),
+        candidate(8.0, xyz=(5.8, 0, 1.5)),
+        candidate(7.5, xyz=(6.0, 0, 1.5)),
+        candidate(7.0, xyz=(0, 0, 1.5), heading_deg=180),
+    ]
     found = hypotheses_of(localized, *several)
     assert [(each.pose.position.x, round(each.pose.heading_deg)) for each in found] == [(0, 0), (5.8, 0), (0, 180)]
     weights = np.exp([9.0, 8.0, 7.0])
@@ -204,8 +210,8 @@ def test_of_an_answer_the_first_hypothesis_is_its_pose_and_the_shares_are_one(lo
     assert shares == sorted(shares, reverse=True)
 
 
-def test_two_streets_that_look_alike_are_two_hypotheses_of_the_same_share_until_one_is_known(twin_map: Path, pictures):
-    """A prior that rules the other street out leaves it no more than the share of doubt, e^-5 against one."""
+def test_two_equal_streets_are_two_hypotheses_with_equal_shares_without_a_prior(twin_map: Path, pictures):
+    """A prior that excludes the other street leaves it the minimum share, e^-5."""
     rgb, depth_m, camera = pictures
     bundle = MapBundle.open(twin_map)
     localizer, query = Localizer.open(bundle), Query(rgb=rgb, depth_m=depth_m, camera=camera)
@@ -254,7 +260,7 @@ def test_a_height_of_no_camera_is_refused(parts_of, camera_document, changed):
     assert caught.value.field == f"camera.{list(changed)[-1]}"
 
 
-def test_a_vehicle_frame_on_the_ground_tells_the_height_of_its_camera(parts_of, camera_document):
+def test_a_vehicle_frame_on_the_ground_gives_the_camera_height(parts_of, camera_document):
     T = at_height(0.42)
     assert query_of(parts_of(T_vehicle_camera=T)).camera_height is None
     assert query_of(parts_of(T_vehicle_camera=T, vehicle_base_on_ground=True)).camera_height == GivenHeight(0.42, 0.1)
@@ -267,12 +273,16 @@ def test_a_vehicle_frame_on_the_ground_tells_the_height_of_its_camera(parts_of, 
     ("changed", "field", "remedy"),
     [
         ({}, "vehicle_base_on_ground", "send it, or send camera.height_m instead"),
-        ({"T_vehicle_camera": at_height(0.0)}, "T_vehicle_camera.position.z", "send T_vehicle_camera of a frame on the ground"),
+        (
+            {"T_vehicle_camera": at_height(0.0)},
+            "T_vehicle_camera.position.z",
+            "send T_vehicle_camera of a frame on the ground",
+        ),
         ({"T_vehicle_camera": at_height(-1.2)}, "T_vehicle_camera.position.z", "would be -1.2 m above the ground"),
         ({"T_vehicle_camera": at_height(30.5)}, "T_vehicle_camera.position.z", "outside 0.05 to 30 m"),
     ],
-)  # fmt: skip
-def test_a_vehicle_frame_that_tells_no_height_is_refused(parts_of, changed, field, remedy):
+)
+def test_a_vehicle_frame_without_a_height_is_refused(parts_of, changed, field, remedy):
     frame = make_frame()
     alone = json.dumps(frame | {"vehicle_base_on_ground": True} | changed).encode()
     together = json.dumps({"frames": [frame], "vehicle_base_on_ground": True} | changed).encode()
@@ -306,8 +316,8 @@ def test_each_camera_of_a_sequence_has_its_own_height():
     assert heights_of(frames) == [GivenHeight(0.3, 0.05), None, GivenHeight(2.0, 0.05)]
 
 
-def test_a_vehicle_frame_on_the_ground_tells_the_heights_of_near_cameras_only():
-    """The second camera is 0.2 m below the first one and beside it. The others are too far ahead, and under the ground."""
+def test_a_vehicle_frame_on_the_ground_gives_the_heights_of_near_cameras_only():
+    """The second camera is 0.2 m below the first one and beside it. The others are too far ahead, or below the ground."""
     frames = [
         make_frame(),
         make_frame() | ahead(0.5, 0.2, 0.5),
@@ -320,7 +330,7 @@ def test_a_vehicle_frame_on_the_ground_tells_the_heights_of_near_cameras_only():
     assert found[2:] == [None, None]
 
 
-def test_an_answer_of_any_status_tells_the_height_and_its_origin(localized):
+def test_an_answer_of_any_status_contains_the_height_and_its_origin(localized):
     found = answer_from(localized).camera_height
     assert found is not None
     assert (found.height_m, found.origin) == (pytest.approx(1.5, abs=0.1), "estimated")
@@ -353,6 +363,13 @@ def test_features_stand_with_an_extrapolated_confidence_and_with_no_other(locali
     content = answer_from(localized).model_dump(by_alias=True) | {"calibration": said, "extrapolated": outside}
     with pytest.raises(ValidationError, match="only then"):
         schema.LocalizeAnswer.model_validate(content)
+
+
+def test_an_answer_states_the_threshold_that_decided(localized):
+    assert answer_from(localized).threshold is None  # this map has no calibration
+    answer = replace(localized.answer, confidence=0.95, threshold=Threshold(false_accept_rate=0.01, confidence=0.9))
+    found = answer_from(replace(localized, answer=answer)).threshold
+    assert found == schema.AcceptanceThreshold(confidence=0.9, false_accept_rate=0.01)
 
 
 def spread_of(localized):

@@ -10,13 +10,13 @@ from service.maps.reader import MapBundle
 
 @pytest.fixture(autouse=True)
 def counted(monkeypatch):
-    """What these tests count on."""
+    """Constants that these tests assume."""
     monkeypatch.setattr(coverage, "CELL_M", 5.0)
     monkeypatch.setattr(coverage, "REACH_M", 7.5)
 
 
 def test_one_place_covers_the_cells_around_it():
-    """At the middle of a cell: centres at 0 and 5 m along either axis are within 7.5 m, (5, 5) at 7.07 too, 10 is not."""
+    """The place is at the centre of a cell. Centres within 7.5 m are covered: 0 and 5 m along an axis, (5, 5) at 7.07 m."""
     assert covered(np.array([[2.5, 2.5]])) == [(-5, -5, 10, 0), (-5, 0, 10, 5), (-5, 5, 10, 10)]
 
 
@@ -31,18 +31,24 @@ def test_no_cell_is_covered_twice_and_every_place_lies_in_one():
     places = np.random.default_rng(0).uniform(-60, 60, (80, 2))
     rectangles = np.array(covered(places))
     inside = (
-        (places[:, None, 0] >= rectangles[:, 0]) & (places[:, None, 0] < rectangles[:, 2])
-        & (places[:, None, 1] >= rectangles[:, 1]) & (places[:, None, 1] < rectangles[:, 3])
-    )  # fmt: skip
+        (places[:, None, 0] >= rectangles[:, 0])
+        & (places[:, None, 0] < rectangles[:, 2])
+        & (places[:, None, 1] >= rectangles[:, 1])
+        & (places[:, None, 1] < rectangles[:, 3])
+    )
     assert (inside.sum(axis=1) == 1).all()
 
 
-def test_a_map_without_georeference_is_told_in_its_own_metres(bundle_path):
+def test_a_map_without_georeference_is_described_in_local_metres(bundle_path):
     bundle = MapBundle.open(bundle_path)
     (feature,) = json.loads(coverage_geojson([bundle]))["features"]
     assert feature["properties"] == {
-        "map": "tiny", "version": bundle.manifest.version, "frame": "map", "places": len(bundle.T_map_place), "reach_m": 7.5,
-    }  # fmt: skip
+        "map": "tiny",
+        "version": bundle.manifest.version,
+        "frame": "map",
+        "places": len(bundle.T_map_place),
+        "reach_m": 7.5,
+    }
     for (ring,) in feature["geometry"]["coordinates"]:
         assert ring[0] == ring[-1]
         (x0, y0), (x1, _), (_, y1) = ring[0], ring[1], ring[2]

@@ -1,4 +1,4 @@
-"""No option without effect: what a request or a setting may say is used, and another value gives another result."""
+"""Every option has an effect: the code reads each field of a request or setting, and another value changes the result."""
 
 import ast
 import dataclasses
@@ -29,9 +29,10 @@ FRAME: Json = {
     "gravity": {"x": 0.1, "y": 1, "z": 0.1},
 }  # fmt: skip
 ABOUT: Json = {
-    "map": "tiny", "T_vehicle_camera": T,
+    "map": "tiny",
+    "T_vehicle_camera": T,
     "options": {"neighbours": 5, "refine": True, "false_accept_rate": 0.02},
-}  # fmt: skip
+}
 POSITION = {"position": {"x": 1, "y": 2, "std_m": 3}, "heading_deg": 10, "heading_std_deg": 20}
 WGS84 = {"wgs84": {"latitude_deg": 1, "longitude_deg": 2, "std_m": 3}, "heading_deg": 10, "heading_std_deg": 20}
 
@@ -45,7 +46,7 @@ def leaves(value: Any, path: tuple[Any, ...] = ()) -> Iterator[tuple[Any, ...]]:
 
 
 def fields_of(model: type[BaseModel], path: tuple[str, ...] = ()) -> Iterator[tuple[str, ...]]:
-    """Paths of a model's fields that are no models themselves; an element of a list has no name of its own."""
+    """Return the paths of all leaf fields of a model. List elements have no name of their own."""
     for name, field in model.model_fields.items():
         inner = [each for each in _types(field.annotation) if isinstance(each, type) and issubclass(each, BaseModel)]
         if inner:
@@ -62,7 +63,7 @@ def _types(annotation: Any) -> Iterator[Any]:
 
 
 def named(document: Json) -> set[tuple[str, ...]]:
-    """The leaves of a document without the numbers of list elements."""
+    """Return the leaves of a document without the indices of list elements."""
     return {tuple(key for key in path if isinstance(key, str)) for path in leaves(document)}
 
 
@@ -76,13 +77,13 @@ SEQUENCES = [
 ]
 
 
-def test_the_documents_say_all_that_a_request_may() -> None:
+def test_the_documents_describe_every_request_field() -> None:
     assert set.union(*map(named, ALONE)) == set(fields_of(schema.LocalizeRequest))
     assert set.union(*map(named, SEQUENCES)) == set(fields_of(schema.SequenceRequest))
 
 
 def other(value: Any, path: tuple[Any, ...]) -> Any:
-    """Another good value, or one that must be refused where there is no other good one."""
+    """Return another valid value, or an invalid one if there is no other valid value."""
     told = {"kind": "range", "encoding": "carla", "map": "west", "model": "OPENCV"}
     if path[-1] in told:
         return told[path[-1]]
@@ -101,7 +102,7 @@ def with_other(document: Json, path: tuple[Any, ...]) -> Json:
 
 
 def plain(value: Any) -> Any:
-    """As something that can be compared."""
+    """Convert a value to something comparable."""
     if isinstance(value, np.ndarray):
         return value.tolist()
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
@@ -110,7 +111,7 @@ def plain(value: Any) -> Any:
 
 
 def asked_alone(document: Json) -> Any:
-    """What the engine is asked, or that the request was refused."""
+    """Return the query that the engine receives, or the refusal."""
     try:
         return plain(query_from(parsed(json.dumps(document).encode(), schema.LocalizeRequest), rgb=b"", depth=b""))
     except StreetfixError as error:
@@ -134,7 +135,7 @@ def asked_in_sequence(document: Json) -> Any:
         for path in leaves(document)
     ],
 )
-def test_another_value_of_any_field_asks_the_engine_something_else_or_is_refused(
+def test_another_value_of_any_field_changes_the_query_or_is_refused(
     asked: Callable[[Json], Any], document: Json, path: tuple[Any, ...]
 ) -> None:
     as_it_is = asked(document)
@@ -150,7 +151,7 @@ def test_a_camera_that_is_not_rectified_is_refused_with_the_remedy(changed: Json
 
 
 def classes_of_options() -> Iterator[type]:
-    """All classes of settings in the service: their names end so."""
+    """Return all settings classes of the service by their suffix."""
     yield from (EncodedQuery, Query, Limits, Settings)
     for path in sorted(SERVICE.rglob("*.py")):
         if "generated" in path.parts:
@@ -167,9 +168,9 @@ def classes_of_options() -> Iterator[type]:
 
 @cache
 def used_names() -> frozenset[str]:
-    """Names that are read as an attribute, or written in a string (of a C struct's fields), anywhere in the service.
+    """Return all names that the service reads as an attribute or writes in a string (fields of C structs).
 
-    A docstring is longer than a name; a field's own declaration is neither.
+    Docstrings are longer than names. The declaration of a field does not count.
     """
     found = set()
     for path in SERVICE.rglob("*.py"):

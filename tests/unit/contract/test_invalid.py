@@ -1,4 +1,4 @@
-"""Errors of pydantic become errors of the request that name the fields."""
+"""Validation errors of pydantic become request errors that name the fields."""
 
 import pytest
 from pydantic import ValidationError
@@ -7,7 +7,7 @@ from service.contract.invalid import invalid, request_error_from
 from service.contract.schema import LocalizeRequest
 
 
-def test_the_error_names_the_first_field_and_tells_the_next_ones() -> None:
+def test_the_error_names_the_first_field_and_lists_the_next_ones() -> None:
     with pytest.raises(ValidationError) as caught:
         LocalizeRequest.model_validate(
             {"camera": {"width": 640, "height": 480, "fx": "wide", "fy": 1e9, "cx": 1, "cy": 1}}

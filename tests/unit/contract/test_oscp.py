@@ -32,7 +32,7 @@ def request_of(cameras=None, **changed):
 
 
 def test_pictures_and_intrinsics_are_taken_over():
-    """COLMAP counts from the first pixel's corner, we from its centre."""
+    """COLMAP counts from the corner of the first pixel, this service from its centre."""
     query = query_of(request_of(), "site")
     assert (query.rgb, query.depth, query.map_name) == (RGB, DEPTH, "site")
     camera = query.camera
@@ -44,11 +44,13 @@ def test_pictures_and_intrinsics_are_taken_over():
 @pytest.mark.parametrize(
     ("model", "numbers", "expected"),
     [
-        ("SIMPLE_PINHOLE", [300, 320, 240], (300, 300, 319.5, 239.5)), ("simple_radial", [300, 320, 240, 0], (300, 300, 319.5, 239.5)),
-        ("RADIAL", [300, 320, 240, 0, 0], (300, 300, 319.5, 239.5)), ("OPENCV", [300, 310, 320, 240, 0, 0, 0, 0], (300, 310, 319.5, 239.5)),
+        ("SIMPLE_PINHOLE", [300, 320, 240], (300, 300, 319.5, 239.5)),
+        ("simple_radial", [300, 320, 240, 0], (300, 300, 319.5, 239.5)),
+        ("RADIAL", [300, 320, 240, 0, 0], (300, 300, 319.5, 239.5)),
+        ("OPENCV", [300, 310, 320, 240, 0, 0, 0, 0], (300, 310, 319.5, 239.5)),
         ("FULL_OPENCV", [300, 310, 320, 240] + [0] * 8, (300, 310, 319.5, 239.5)),
     ],
-)  # fmt: skip
+)
 def test_every_camera_model_is_read(model, numbers, expected):
     colour = reading("RGBA32", RGB, params={"model": model, "modelParams": numbers})
     camera = query_of(request_of([colour, reading("DEPTH", DEPTH, params=None)]), None).camera
@@ -58,18 +60,20 @@ def test_every_camera_model_is_read(model, numbers, expected):
 @pytest.mark.parametrize(
     ("params", "error"),
     [
-        (None, RequestError), ({"model": "PINHOLE", "modelParams": [300, 310, 320]}, RequestError),
-        ({"model": "FISHEYE", "modelParams": [1] * 4}, RequestError), ({"model": None, "modelParams": None}, RequestError),
+        (None, RequestError),
+        ({"model": "PINHOLE", "modelParams": [300, 310, 320]}, RequestError),
+        ({"model": "FISHEYE", "modelParams": [1] * 4}, RequestError),
+        ({"model": None, "modelParams": None}, RequestError),
         ({"model": "SIMPLE_RADIAL", "modelParams": [300, 320, 240, 0.1]}, NotYetSupportedError),
         ({"model": "PINHOLE", "modelParams": [-300, 310, 320, 240]}, RequestError),
     ],
-)  # fmt: skip
+)
 def test_intrinsics_that_make_no_sense_are_refused(params, error):
     with pytest.raises(error):
         query_of(request_of([reading("RGBA32", RGB, params=params), reading("DEPTH", DEPTH)]), None)
 
 
-def test_rgb_alone_is_told_what_is_missing():
+def test_a_query_without_depth_is_refused_with_the_missing_part():
     with pytest.raises(RequestError, match=r"imageFormat DEPTH.*second reading") as caught:
         query_of(request_of([reading("RGBA32", RGB)]), None)
     assert caught.value.field == "sensorReadings.cameraReadings"
@@ -82,11 +86,13 @@ def test_rgb_alone_is_told_what_is_missing():
 @pytest.mark.parametrize(
     ("params", "size", "fits"),
     [
-        (PINHOLE, [640, 480], True), ({"model": "SIMPLE_PINHOLE", "modelParams": [153, 160, 120]}, [320, 240], True), (None, None, True),
+        (PINHOLE, [640, 480], True),
+        ({"model": "SIMPLE_PINHOLE", "modelParams": [153, 160, 120]}, [320, 240], True),
+        (None, None, True),
         ({"model": "PINHOLE", "modelParams": [380, 380, 320, 240]}, [640, 480], False),
         ({"model": "PINHOLE", "modelParams": [300, 310, 340, 240]}, [640, 480], False),
     ],
-)  # fmt: skip
+)
 def test_depth_of_another_view_is_refused_not_misread(params, size, fits):
     request = request_of([reading("RGBA32", RGB), reading("DEPTH", DEPTH, params=params, size=size)])
     if fits:
@@ -128,8 +134,8 @@ def test_upright_pictures_are_not(upright):
         ({"x": 9.81, "y": 0.001, "z": 0}, (-1, 0, 0)),  # turned to its right side up: down is the picture's left
         ({"x": 0, "y": 9.0, "z": 1.0}, (0, 0.9939, 0.1104)),  # leaning back, the lens looks down a little
     ],
-)  # fmt: skip
-def test_the_accelerometer_says_where_down_is(felt, down):
+)
+def test_the_accelerometer_gives_the_down_direction(felt, down):
     query = query_of(request_of(readings={"accelerometerReadings": [{"x": 1, "y": 1, "z": 1}, felt]}), None)
     assert query.down_camera is not None
     np.testing.assert_allclose(query.down_camera, down, atol=2e-4)
@@ -154,7 +160,7 @@ def test_a_satellite_fix_is_a_prior():
 
 @pytest.mark.parametrize("accuracy", [0.0, -1.0, 3.4028234663852886e38, 1.7976931348623157e308, None])
 def test_an_accuracy_that_is_a_structures_first_value_is_not_known(accuracy):
-    """The clients' own structures begin with 0, and those of earlier poses with the largest float."""
+    """The reference clients initialise accuracies with 0, and those of earlier poses with the largest float."""
     fix = {"latitude": 48.1, "longitude": 11.5, "accuracy": accuracy}
     geopose = {"position": {"lat": 48, "lon": 11, "h": 0}, "quaternion": NORTH}
     earlier = {"geopose": geopose, "accuracy": {"position": accuracy}}
@@ -164,7 +170,7 @@ def test_an_accuracy_that_is_a_structures_first_value_is_not_known(accuracy):
         assert prior.position_std_m == 20.0
 
 
-def test_a_picture_may_be_called_what_it_is():
+def test_an_image_may_have_its_real_suffix():
     assert query_of(request_of([reading("JPG", RGB), reading("DEPTH", DEPTH)]), None).rgb == RGB
 
 

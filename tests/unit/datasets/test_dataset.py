@@ -8,6 +8,7 @@ from model_training.datasets.dataset import (
     Dataset,
     DatasetDescription,
     Sensors,
+    SurveyAccuracy,
     read_tum,
     require_map_first,
     scan_path,
@@ -26,7 +27,7 @@ POSE = "0.000000 1 2 3 0 0 0 1"
 
 
 def make_dataset(folder):
-    """Two scans, one query set of two pairs with truth; pictures are never decoded here."""
+    """Make two scans and one query set of two pairs with ground truth. The images are never decoded."""
     camera = CameraSensor(name="front", width=64, height=48, fx=32, fy=32, cx=31.5, cy=23.5)
     description = DatasetDescription(name="small", source={"kind": "test"}, sensors=Sensors(cameras=[camera]))
     scan_path(folder, 0).parent.mkdir(parents=True)
@@ -50,7 +51,7 @@ def folder(tmp_path):
 
 
 def read_all(folder):
-    """Everything that reads of a dataset without decoding pictures."""
+    """Read everything of a dataset that needs no decoding of images."""
     dataset = Dataset(folder)
     for number in range(len(dataset.survey_poses())):
         dataset.scan(number)
@@ -158,6 +159,21 @@ def test_sets_without_truth_have_frames_without_pose(folder):
     assert [(frame.T_map_camera, frame.stamp_s) for frame in dataset.queries("drive")] == [(None, None)] * 2
 
 
+def test_a_set_may_have_odometry(folder):
+    assert Dataset(folder).odometry("drive") is None
+    poses = np.stack([transform_from(rotation_z(0.1), np.array([k, 0.0, 0.0])) for k in range(2)])
+    write_tum(folder / "queries" / "drive" / "odometry.txt", np.arange(2.0), poses)
+    found = Dataset(folder).odometry("drive")
+    assert found is not None
+    np.testing.assert_allclose(found, poses, atol=1e-6)
+
+
+def test_damaged_odometry_is_named_with_its_line(folder):
+    (folder / "queries" / "drive" / "odometry.txt").write_text(f"{POSE}\n0 1 2\n")
+    with pytest.raises(DatasetError, match=r"odometry\.txt, line 2"):
+        Dataset(folder).odometry("drive")
+
+
 def test_frames_carry_the_timestamps_of_their_poses(folder):
     path = folder / "queries" / "drive" / "poses.txt"
     poses = read_tum(path)[1]
@@ -208,3 +224,20 @@ def test_a_dataset_before_its_map_is_named(folder, bundle_path, tmp_path):
         f"{folder} is a dataset and {bundle_path} is a map bundle: give the map bundle first: "
         f"streetfix map update {bundle_path} {folder}"
     )
+
+
+def test_an_unknown_accuracy_of_the_survey_is_left_out_and_a_known_one_is_read_again(tmp_path):
+    make_dataset(tmp_path)
+    assert "survey_accuracy" not in json.loads((tmp_path / "dataset.json").read_text())
+    known = SurveyAccuracy(position_std_m=0.08, angle_std_deg=0.1)
+    write_description(tmp_path, Dataset(tmp_path).description.model_copy(update={"survey_accuracy": known}))
+    assert Dataset(tmp_path).description.survey_accuracy == known
+
+
+@pytest.mark.parametrize("value", [-0.1, 5.1])
+def test_an_accuracy_of_the_survey_out_of_bounds_is_refused(tmp_path, value):
+    make_dataset(tmp_path)
+    accuracy = {"position_std_m": value, "angle_std_deg": 0.1}
+    change_json(tmp_path / "dataset.json", lambda d: d.update(survey_accuracy=accuracy))
+    with pytest.raises(DatasetError, match=r"dataset.json: survey_accuracy.position_std_m"):
+        Dataset(tmp_path)

@@ -1,4 +1,4 @@
-"""Files that vanish, cannot be read or are cut off while a command reads them: an error of ours that names the file, never another."""
+"""Files that vanish, cannot be read or are truncated while a command reads them give a clear error that names the file."""
 
 import shutil
 
@@ -16,7 +16,7 @@ def frames_of(dataset):
 
 
 def read_all(dataset, frames=None):
-    """As build-map and evaluate do, pictures too; ``frames`` were listed before."""
+    """Read as build-map and evaluate do, with images. ``frames`` were listed before."""
     for number in range(len(dataset.survey_poses())):
         dataset.scan(number)
     dataset.streets()
@@ -32,7 +32,7 @@ def dataset(small_dataset, tmp_path):
 
 
 def kinds_of(folder):
-    """One file of every kind that is read after the dataset was opened."""
+    """Return one file of every kind that is read after the dataset was opened."""
     found = sorted(path for path in folder.rglob("*") if path.is_file() and path.parent != folder)
     return {(path.parent.name, path.suffix): path for path in found}.values()
 
@@ -55,7 +55,7 @@ def test_every_file_that_vanishes_while_a_dataset_is_read_is_named(dataset):
 
 @pytest.mark.parametrize("share", [0.0, 0.37, 0.9])
 def test_every_file_that_is_cut_off_gives_an_error_of_ours_or_is_read(dataset, share):
-    """A scan cut at a row's end, or a text at a line's, is a shorter one: that cannot be told."""
+    """A scan truncated at a row end, or a text truncated at a line end, is a valid shorter file."""
     for path in list(kinds_of(dataset.folder)):
         content = path.read_bytes()
         path.write_bytes(content[: int(share * len(content))])
@@ -71,7 +71,7 @@ def test_every_file_that_is_cut_off_gives_an_error_of_ours_or_is_read(dataset, s
 
 @pytest.mark.parametrize("kind", ["rgb", "depth"])
 def test_a_damaged_picture_is_named(dataset, kind):
-    """Its own error spoke of a request's field, which nobody who reads a dataset has sent."""
+    """Earlier, the error named a field of a request. A user who reads a dataset sends no request."""
     frame = next(dataset.queries("drive1_precise"))
     path = frame.rgb_path if kind == "rgb" else frame.depth_path
     path.write_bytes(path.read_bytes()[:100])
@@ -90,7 +90,7 @@ def test_a_scan_that_becomes_shorter_between_two_looks_is_refused(dataset, monke
         dataset.scan(3)
 
 
-def test_what_the_system_says_is_told_with_the_file(tmp_path):
+def test_a_system_error_is_reported_with_the_file(tmp_path):
     path = tmp_path / "a.bin"
     for read in (read_bytes, size_of):
         with pytest.raises(DatasetError, match=r"a\.bin: the file is missing, or was removed"):

@@ -12,7 +12,7 @@ XY = [(0, 0), (10, 0), (20, 0), (0, 100), (10, 100), (50, 50), (0, 200), (60, 20
 
 
 def rectangle(street, x, y, *, section=None):
-    """10 m wide, from x[0] to x[1], about y."""
+    """Return a street polygon, 10 m wide, from x[0] to x[1], centred at y."""
     (x0, x1), (y0, y1) = x, (y - 5, y + 5)
     ring = [[x0, y0], [x1, y0], [x1, y1], [x0, y1], [x0, y0]]
     properties = {
@@ -33,16 +33,19 @@ def folder(tmp_path):
     poses = np.stack([transform_from(rotation_z(0.1 * k), np.array([*xy, 2.0])) for k, xy in enumerate(XY)])
     write_tum(tmp_path / "survey" / "poses.txt", np.arange(float(len(XY))), poses)
     features = [
-        rectangle("3", (-10, 30), 200, section="beginning"), rectangle("3", (30, 90), 200, section="end"),
-        rectangle("10", (-10, 90), 0), rectangle("2", (-10, 90), 100), rectangle("4", (-10, 90), 300),
-    ]  # fmt: skip
+        rectangle("3", (-10, 30), 200, section="beginning"),
+        rectangle("3", (30, 90), 200, section="end"),
+        rectangle("10", (-10, 90), 0),
+        rectangle("2", (-10, 90), 100),
+        rectangle("4", (-10, 90), 300),
+    ]
     (tmp_path / "streets.geojson").write_text(json.dumps({"type": "FeatureCollection", "features": features}))
     write_description(tmp_path, DatasetDescription(name="town", source={"kind": "test"}, sensors={}))
     return tmp_path
 
 
 def numbers_left(dataset):
-    """Which scans are left, by what they hold."""
+    """Return the numbers of the remaining scans, by their content."""
     return [int(dataset.scan(k)[0, 0]) for k in range(len(dataset.survey_poses()))]
 
 
@@ -89,11 +92,11 @@ def test_a_dataset_without_streets_is_left_whole(folder):
      ((10, 129), False), ((10, 131), True), ((50, 21), False), ((50, 19), True)],
 )  # fmt: skip
 def test_outside_is_further_than_thirty_metres_from_every_scan_that_is_left(folder, xy, outside):
-    """The street that was left out is; its mouth, near a scan of another street, is not."""
+    """The removed street is outside. Its end, near a scan of another street, is not."""
     assert WithoutStreets(folder).is_outside(np.array([xy], np.float64)).tolist() == [outside]
 
 
-def test_how_far_away_is_outside_may_be_told_and_many_are_asked_at_once(folder):
+def test_the_distance_limit_of_outside_is_an_argument_and_many_points_are_tested_at_once(folder):
     xy = np.array([(10.0, 105.0), (50.0, 55.0), (500.0, 500.0)])
     dataset = WithoutStreets(folder)
     assert dataset.is_outside(xy, away_m=4.9).tolist() == [True, True, True]

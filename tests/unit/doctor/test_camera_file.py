@@ -50,7 +50,7 @@ def test_a_missing_file_is_a_problem(tmp_path):
     [({}, "ok"), ({"cx": 383.5}, "ok"), ({"cx": 390}, "warning"), ({"cy": 287.5}, "ok"), ({"cy": 180}, "warning")],
 )
 def test_the_principal_point_lies_within_a_tenth_of_the_centre(changed, level):
-    """A tenth of 640 px is 64 px, so cx may be 319.5 +- 64; a tenth of 480 px is 48 px."""
+    """A tenth of 640 px is 64 px, so cx may be 319.5 +- 64. A tenth of 480 px is 48 px."""
     assert camera_file.check_principal_point(camera(**changed)).level == level
 
 
@@ -66,13 +66,13 @@ def test_the_field_of_view_is_30_to_150_degrees(fx, level):
     assert camera_file.check_field_of_view(camera(fx=fx)).level == level
 
 
-def test_the_field_of_view_is_told():
+def test_the_field_of_view_is_printed():
     assert camera_file.check_field_of_view(camera()).text == "90 degrees across and 74 degrees down"
 
 
 @pytest.mark.parametrize(("fy", "level"), [(320, "ok"), (256, "ok"), (400, "ok"), (250, "warning"), (410, "warning")])
 def test_focal_lengths_differ_by_a_fifth_at_most(fy, level):
-    """A fifth of the longer one: of 320 px that is 64 px, of 400 px 80 px."""
+    """The limit is a fifth of the larger focal length: 64 px of 320 px, 80 px of 400 px."""
     assert camera_file.check_focal_lengths(camera(fy=fy)).level == level
 
 

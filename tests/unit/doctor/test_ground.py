@@ -10,7 +10,7 @@ CAMERA = PinholeCamera(160, 120, 80.0, 80.0, 79.5, 59.5)
 
 
 def plane(height_m, pitch_deg=0.0):
-    """z of an endless ground below a camera that is pitched down; 0 above the horizon and beyond 60 m."""
+    """Return z of an infinite ground below a camera that is pitched down; 0 above the horizon and beyond 60 m."""
     R = rotation_y(np.deg2rad(pitch_deg)) @ R_BODY_OPTICAL
     down = -(CAMERA.rays_of_pixels() @ R.T)[..., 2]
     z = np.where(down > 1e-6, height_m / np.maximum(down, 1e-6), 0.0)
@@ -93,12 +93,12 @@ def ground(**changed):
         ({"roll_deg": 20.0}, "rolled by 20 degrees", "send gravity"),
     ],
 )  # fmt: skip
-def test_what_is_unusual_is_a_warning(changed, text, remedy):
+def test_unusual_values_are_a_warning(changed, text, remedy):
     found = check_ground(ground(**changed))
     assert found.level == "warning"
     assert text in found.text
     assert remedy in found.remedy
 
 
-def test_what_is_usual_is_ok():
+def test_usual_values_are_ok():
     assert check_ground(ground()).level == "ok"

@@ -29,7 +29,7 @@ def test_another_platform_is_a_problem_that_says_where_the_service_runs(monkeypa
 
 
 def test_a_quota_limits_the_cores(monkeypatch, tmp_path):
-    """150 ms of processor time in each 100 ms: one and a half cores, so two threads."""
+    """150 ms of processor time in each 100 ms are 1.5 cores, so two threads."""
     (tmp_path / "cpu.max").write_text("150000 100000\n")
     monkeypatch.setattr(os, "cpu_count", lambda: 8)
     monkeypatch.setattr(os, "sched_getaffinity", lambda _: set(range(8)), raising=False)
@@ -61,7 +61,7 @@ def test_without_a_description_of_the_processor_avx2_is_unknown(monkeypatch, tmp
 
 
 def free_of(monkeypatch, mib: dict[str, int]) -> None:
-    """Free space by folder; any other folder is missing."""
+    """Return the free space of a folder. All other folders are missing."""
 
     def usage(folder: Path) -> object:
         if str(folder) not in mib:
@@ -78,7 +78,7 @@ def test_shared_memory_is_ok_even_without_dev_shm(monkeypatch):
     assert found.text.endswith("/none does not exist, and the service does not use it")
 
 
-def test_the_free_space_of_dev_shm_is_told(monkeypatch):
+def test_the_free_space_of_dev_shm_is_printed(monkeypatch):
     free_of(monkeypatch, {"/t": 1000, "/shm": 64})
     assert machine.check_shared_memory(Path("/shm"), temporary=Path("/t")).text.endswith(
         "/shm has 64 MiB left, and the service does not use it"
@@ -117,8 +117,10 @@ def test_a_library_of_another_release_is_a_problem():
 
     found = machine.check_libraries({"good": object, "x": old})
     assert (found.level, found.text, found.remedy) == (
-        "problem", "_x.so was not compiled from the C files of this release", "install the package again",
-    )  # fmt: skip
+        "problem",
+        "_x.so was not compiled from the C files of this release",
+        "install the package again",
+    )
 
 
 def test_a_library_of_another_processor_is_a_problem():
@@ -139,7 +141,7 @@ def test_a_port_that_is_taken_is_a_problem_where_the_user_named_it(named, level)
     assert found.remedy == "if no Streetfix service runs there already, choose another --port"
 
 
-def test_a_port_that_nobody_has_is_free():
+def test_an_unused_port_is_free():
     assert machine.check_port("--port", "127.0.0.1", 0, named=True).level == "ok"
     assert machine.check_port("--grpc-port", "127.0.0.1", None, named=False).text == "not requested (--grpc-port)"
 

@@ -5,7 +5,7 @@ from service.maps.reader import MapBundle
 from service.maps.writer import write_bundle
 
 
-def test_a_good_bundle_opens_and_its_parts_are_told(bundle_path):
+def test_a_valid_bundle_opens_and_its_parts_are_listed(bundle_path):
     told, bundle = on_disk.check_bundle(bundle_path)
     assert told.level == "ok"
     assert told.text.startswith("tiny, version ")
@@ -31,8 +31,10 @@ def test_a_changed_byte_is_a_problem_with_the_name_of_the_file(bundle_copy):
     told, bundle = on_disk.check_bundle(bundle_copy)
     assert bundle is None
     assert (told.level, told.text, told.remedy) == (
-        "problem", f"{file}: the hash does not match the manifest", "copy or build the bundle again",
-    )  # fmt: skip
+        "problem",
+        f"{file}: the hash does not match the manifest",
+        "copy or build the bundle again",
+    )
 
 
 def test_a_folder_without_a_map_is_a_problem(tmp_path):

@@ -30,12 +30,12 @@ def pair(parts_of):
 
 
 def test_the_camera_sees_the_rows_within_its_field_of_view(pair, localizer):
-    """24 px above and below at a focal length of 32 px are 37 degrees, and the grid ends at 15 degrees."""
+    """24 px above and below the centre at a focal length of 32 px are 37 degrees. The grid ends at 15 degrees."""
     assert rows_of_camera(pair, localizer.bundle).tolist() == [True] * 8
 
 
 def test_a_narrow_camera_sees_fewer_rows(pair, localizer):
-    """With fy 200 px, the image ends 6.8 degrees above and below; the rows lie at 2.1, 6.4, 10.7 and 15 degrees."""
+    """With fy = 200 px the image ends 6.8 degrees above and below. The rows are at 2.1, 6.4, 10.7 and 15 degrees."""
     camera = replace(pair.encoded.camera, fy=200.0)
     narrow = replace(pair, encoded=replace(pair.encoded, camera=camera, down_camera=np.array([0.0, 1.0, 0.0])))
     assert rows_of_camera(narrow, localizer.bundle).tolist() == [False, False, True, True, True, True, False, False]
@@ -43,9 +43,12 @@ def test_a_narrow_camera_sees_fewer_rows(pair, localizer):
 
 @pytest.mark.parametrize(
     ("camera", "lidar", "level", "share"),
-    [([1, 1, 1, 1], [0, 0, 1, 1], "ok", "50%"), ([1, 1, 1, 0], [0, 0, 1, 1], "warning", "33%"),
-     ([1, 1, 0, 0], [0, 0, 1, 1], "warning", "0%")],
-)  # fmt: skip
+    [
+        ([1, 1, 1, 1], [0, 0, 1, 1], "ok", "50%"),
+        ([1, 1, 1, 0], [0, 0, 1, 1], "warning", "33%"),
+        ([1, 1, 0, 0], [0, 0, 1, 1], "warning", "0%"),
+    ],
+)
 def test_the_lidar_must_see_half_of_the_cameras_rows(camera, lidar, level, share):
     found = check_rows(np.array(camera, bool), np.array(lidar, bool), ELEVATIONS_RAD)
     assert found.level == level
@@ -70,7 +73,7 @@ def test_the_answer_is_that_of_the_service(pair, localizer, bundle_path):
 
 
 def test_an_answer_that_is_not_localized_is_a_warning_with_its_reasons(pair, content_of, calibration_json, tmp_path):
-    """At even odds of the position and three in four for the map, the confidence is below the threshold of 0.9."""
+    """The log odds of 0.5 and 0.75 give a confidence below the threshold of 0.9."""
     write_bundle(tmp_path / "own", content_of(calibration=calibration_json()))
     localizer = Localizer.open(MapBundle.open(tmp_path / "own"))
     told = check_answer(pair, localizer, 0.001)

@@ -19,7 +19,7 @@ def npy(values):
 
 @pytest.fixture
 def encoded(parts_of):
-    """The good pair: 64 x 48 pixels, float metres, 4 to 15 m away."""
+    """Return the valid pair: 64 x 48 pixels, float metres, 4 to 15 m away."""
 
     def make(depth=None, **changed):
         parts = parts_of(**changed)
@@ -110,7 +110,7 @@ def test_metres_taken_for_millimetres_are_named(encoded, depth_m):
 
 
 def test_a_limit_of_the_range_does_not_hide_the_unit(encoded, depth_m):
-    """At a thousand times the depth, all pixels lie beyond 80 m."""
+    """With depths times 1000, all pixels are beyond 80 m."""
     pair = pair_of(replace(encoded(depth=npy(depth_m * 1000)), max_range_m=80.0))
     assert not pair.depth_m.any()
     told, tried = check_depth_unit(pair)
@@ -119,7 +119,7 @@ def test_a_limit_of_the_range_does_not_hide_the_unit(encoded, depth_m):
 
 
 def test_a_depth_that_no_unit_explains_is_a_warning(encoded, depth_m):
-    """0.25 m: a thousandth is 0.25 mm, and a thousand times is 250 m."""
+    """The depth is 0.25 m. A thousandth is 0.25 mm, and 1000 times is 250 m."""
     pair = pair_of(encoded(depth=npy(np.full((48, 64), 0.25, np.float32))))
     told, same = check_depth_unit(pair)
     assert (told.level, same) == ("warning", pair)
@@ -127,7 +127,7 @@ def test_a_depth_that_no_unit_explains_is_a_warning(encoded, depth_m):
 
 
 def test_a_disparity_is_tried_in_its_own_unit(encoded, depth_m):
-    """z = fx baseline / disparity: 32 px x 0.5 m / 2 px = 8 m. In thousandths of a pixel the scale 1 gives 8 mm."""
+    """z = fx baseline / disparity: 32 px x 0.5 m / 2 px = 8 m. In thousandths of a pixel, the scale 1 gives 8 mm."""
     stored = npy(np.full((48, 64), 2000.0, np.float32))
     query = replace(encoded(depth=stored), depth_kind="disparity", baseline_m=0.5, scale_m=1.0)
     told, tried = check_depth_unit(pair_of(query))
@@ -150,5 +150,5 @@ def test_a_tenth_of_the_pixels_must_have_a_depth(encoded, rows, level):
     assert check_measured_share(pair_of(encoded(depth=npy(depth_m)))).level == level
 
 
-def test_numbers_are_told_without_powers_of_ten():
+def test_numbers_are_printed_without_powers_of_ten():
     assert [module._plain(number) for number in (20123.4, 8.0, 0.00699)] == ["20100", "8", "0.00699"]

@@ -8,7 +8,7 @@ BOXES = ((40, 60, 30, 50, 4.0), (110, 100, 45, 70, 6.0), (190, 50, 25, 90, 3.0),
 
 
 def scene(right_px=0, down_px=0):
-    """Boxes of another colour than the wall 12 m away; the depth may lie beside the colour."""
+    """Return boxes in front of a wall 12 m away, in another colour. The depth may be shifted against the colour."""
     rgb, depth_m = np.full((240, 320, 3), 90, np.uint8), np.full((240, 320), 12.0, np.float32)
     for number, (u, v, wide, high, z) in enumerate(BOXES):
         rgb[v : v + high, u : u + wide] = 150 + 20 * number
@@ -50,7 +50,7 @@ def test_depth_beside_the_colour_is_a_warning_that_says_how_far(right_px, down_p
 
 
 def test_the_shift_is_in_pixels_of_the_colour_image():
-    """The image has 640 columns, and is compared at 320."""
+    """The image has 640 columns, and the check compares at 320."""
     rgb, depth_m = scene(10, 0)
     shift = edge_shift(rgb.repeat(2, axis=0).repeat(2, axis=1), depth_m)
     assert shift is not None
@@ -62,6 +62,6 @@ def test_depth_without_edges_is_not_compared():
     assert (found.level, found.text) == ("ok", "not compared: the depth image has too few edges")
 
 
-def test_colour_without_edges_does_not_say_that_a_shift_is_better():
+def test_colour_without_edges_suggests_no_shift():
     _, depth_m = scene()
     assert check_registered(np.full((240, 320, 3), 90, np.uint8), depth_m).level == "ok"

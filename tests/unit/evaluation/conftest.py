@@ -11,7 +11,7 @@ import pytest
 
 
 class Ape(NamedTuple):
-    """What ``evo_ape`` says of the translations in two trajectories; ``pairs`` of poses belong together by time."""
+    """The output of ``evo_ape`` for the translations of two trajectories. It associates ``pairs`` of poses by time."""
 
     rmse_m: float
     pairs: int
@@ -19,7 +19,7 @@ class Ape(NamedTuple):
 
 @pytest.fixture
 def evo_ape(tmp_path: Path) -> Callable[..., Ape]:
-    """``evo_ape tum TRUE ANSWERED`` with further options."""
+    """Run ``evo_ape tum TRUE ANSWERED`` with further options."""
     beside = Path(sys.executable).with_name("evo_ape")
     program = str(beside) if beside.exists() else shutil.which("evo_ape")
     if program is None:
@@ -29,8 +29,13 @@ def evo_ape(tmp_path: Path) -> Callable[..., Ape]:
         # evo keeps its settings in the home folder: it gets one of its own.
         done = subprocess.run(
             [program, "tum", str(true), str(answered), "--pose_relation", "trans_part", "--verbose", *options],
-            cwd=tmp_path, env=os.environ | {"HOME": str(tmp_path)}, capture_output=True, text=True, check=False, timeout=120,
-        )  # fmt: skip
+            cwd=tmp_path,
+            env=os.environ | {"HOME": str(tmp_path)},
+            capture_output=True,
+            text=True,
+            check=False,
+            timeout=120,
+        )
         assert done.returncode == 0, done.stdout + done.stderr
         error, count = re.search(r"rmse\s+([\d.]+)", done.stdout), re.search(r"Compared (\d+)", done.stdout)
         assert error is not None

@@ -1,4 +1,4 @@
-"""Two saved runs against each other."""
+"""Comparison of two saved runs."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -13,7 +13,7 @@ from service.errors import DatasetError
 
 @pytest.fixture
 def run_of(saved_run):
-    """A run with other answers, one set or several."""
+    """Return a run with other answers, for one set or several."""
 
     def made(name, **predictions):
         return replace(SavedRun.open(saved_run), folder=Path(name), predictions=predictions)
@@ -33,7 +33,7 @@ def test_queries_that_changed_sides_are_named(run_of, answers_of):
 
 
 def judged(answers_of, errors_m, accepted):
-    """Answers so far off, accepted (1) or not (0)."""
+    """Return answers with given errors, accepted (1) or not (0)."""
     p = answered(answers_of, *errors_m)
     return replace(p, status=np.where(np.array(accepted, bool), "LOCALIZED", "OUT_OF_MAP"))
 
@@ -51,7 +51,7 @@ def test_few_changes_are_called_chance_and_many_are_not(run_of, answers_of):
 
 @pytest.mark.parametrize(("right", "wrong"), [(7, 17), (7, 1), (20, 1)])
 def test_a_run_that_accepts_more_wrong_answers_is_never_called_better(run_of, answers_of, right, wrong):
-    """Retrieval alone on a real drive: all accepted, seven right, seventeen wrong, against a run that accepted nothing."""
+    """Retrieval alone on a real drive accepts all: seven right, seventeen wrong. The other run accepts nothing."""
     errors = [0.1] * right + [9] * wrong
     none, all_ = judged(answers_of, errors, [0] * len(errors)), judged(answers_of, errors, [1] * len(errors))
     assert not compare(run_of("a", x=none), run_of("b", x=all_)).verdict.startswith("B is better")

@@ -1,4 +1,4 @@
-"""Errors of matching, by hand: a wall that two scans agree about, and a depth picture of it that is off by a known disparity."""
+"""Matching errors computed by hand: two scans show a wall, and a depth image of it has a known disparity error."""
 
 from pathlib import Path
 
@@ -26,7 +26,7 @@ FOCAL_BASELINE = FOCAL * BASELINE_M
 
 
 def recording(folder: Path, *, off_px: float, baseline_m: float | None = BASELINE_M, hole: bool = False) -> Dataset:
-    """A camera at x = 0 that looks along x at a wall 10 m ahead; scans at x = 1 and x = -1 show it."""
+    """Make a recording: the camera at x = 0 looks along x at a wall 10 m ahead. Scans at x = 1 and x = -1 show the wall."""
     y, z = np.meshgrid(np.arange(-6, 6, 0.1), np.arange(-4, 4, 0.1))
     scan_path(folder, 0).parent.mkdir(parents=True)
     poses = []
@@ -48,9 +48,15 @@ def recording(folder: Path, *, off_px: float, baseline_m: float | None = BASELIN
     write_tum(queries / "poses.txt", np.zeros(1), transform_from(R_BODY_OPTICAL, np.zeros(3))[None])
     lidar = LidarSensor(name="l", channels=64, top_deg=20, bottom_deg=-20, max_range_m=50)
     camera = CameraSensor(
-        name="c", width=WIDTH, height=HEIGHT, fx=FOCAL, fy=FOCAL, cx=79.5, cy=59.5,
+        name="c",
+        width=WIDTH,
+        height=HEIGHT,
+        fx=FOCAL,
+        fy=FOCAL,
+        cx=79.5,
+        cy=59.5,
         depth=DepthSpec(scale_m=0.001, kind="z", baseline_m=baseline_m),
-    )  # fmt: skip
+    )
     write_description(
         folder,
         DatasetDescription(name="wall", source={"kind": "test"}, sensors=Sensors(lidars=[lidar], cameras=[camera])),
@@ -59,7 +65,7 @@ def recording(folder: Path, *, off_px: float, baseline_m: float | None = BASELIN
 
 
 @pytest.mark.parametrize("off_px", [0.0, 1.5, -0.5])
-def test_what_the_depth_is_off_by_is_found_in_disparity(tmp_path, off_px):
+def test_a_depth_error_is_found_as_disparity(tmp_path, off_px):
     found = disparity_errors(recording(tmp_path / "d", off_px=off_px), "recorded")
     assert len(found.error_px) > 1000
     np.testing.assert_allclose(found.error_px, off_px, atol=2e-3)  # whole millimetres at 10 m are 0.001 px
@@ -79,7 +85,7 @@ def test_a_recording_without_a_baseline_is_refused(tmp_path):
 
 
 def test_a_ramp_has_its_slope_as_gradient():
-    """Grey rises by three a pixel."""
+    """The grey level rises by three per pixel."""
     ramp = np.repeat((np.arange(60, dtype=np.uint8) * 3)[None, :, None], 3, axis=2).repeat(40, axis=0)
     np.testing.assert_allclose(gradient_of(ramp)[20, 20:40], 3.0, atol=0.05)
 
@@ -103,7 +109,7 @@ def test_outliers_are_counted_in_their_range():
 
 
 def test_independent_errors_have_a_short_correlation_and_smoothed_ones_a_long_one():
-    """A moving mean over n values has a triangular correlation, 1 - lag / n: 1/e at 0.63 n."""
+    """A moving mean over n values has a triangular correlation, 1 - lag / n. It is 1/e at 0.63 n."""
     noise = np.random.default_rng(0).normal(0, 0.5, 40_000)
     assert errors_of(noise).correlation_length_px() < 2
     smooth = np.convolve(noise, np.full(32, 1 / np.sqrt(32)), "valid")

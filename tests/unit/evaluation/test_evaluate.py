@@ -24,7 +24,7 @@ STAMPS = 1403636579.75 + 0.5 * np.arange(5, dtype=np.float64)
 
 @pytest.fixture
 def stamped(small_dataset, tmp_path):
-    """The small dataset as if it were recorded: timestamps of a clock, and a picture without depth among the queries."""
+    """Return the small dataset like a recording: timestamps of a clock, and one query image without depth."""
     folder = shutil.copytree(small_dataset.folder, tmp_path / "stamped")
     queries = folder / "queries" / NAME
     write_tum(queries / "poses.txt", STAMPS, read_tum(queries / "poses.txt")[1])
@@ -43,7 +43,7 @@ def test_the_trajectory_has_the_timestamps_of_the_truth(small_map, stamped, tmp_
 
 
 def test_the_trajectory_leaves_out_what_was_not_accepted(small_map, stamped, tmp_path, evo_ape):
-    """So that evo's figure is ours where a map refuses answers, too."""
+    """The figure of evo must equal ours also if the map refuses answers."""
     found = evaluate(MapBundle.open(small_map), stamped, [NAME]).predictions[NAME]
     refused = replace(found, status=np.where(np.arange(5) == 1, "AMBIGUOUS", found.status))
     write_trajectory(tmp_path / "answers.txt", refused)
@@ -57,7 +57,7 @@ ELSEWHERE, HERE, UNKNOWN = ("city-1000",), ("city-1000", "city-9"), ()
 
 @pytest.fixture
 def split_in(tmp_path):
-    """The split of a set, in a dataset of this source, for an encoder that was trained on these cities."""
+    """Return the split of a set, for a dataset with this source and an encoder trained on these cities."""
 
     def of(source, name, trained_on):
         write_description(tmp_path, DatasetDescription(name="any", source=source, sensors=Sensors()))

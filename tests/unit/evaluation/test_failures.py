@@ -1,4 +1,4 @@
-"""Which stage lost a query."""
+"""The stage at which a query was lost."""
 
 import numpy as np
 import pytest
@@ -40,9 +40,10 @@ def test_every_stage_is_explained():
 
 def test_an_accepted_wrong_answer_is_worse_than_a_farther_doubted_one_and_none_is_worse_than_that(answers_of):
     p = answers_of(
-        [[0, 0]] * 5, [[0.1, 0], [50, 0], [NAN, NAN], [3, 0], [0.7, 0]],
+        [[0, 0]] * 5,
+        [[0.1, 0], [50, 0], [NAN, NAN], [3, 0], [0.7, 0]],
         status=["LOCALIZED", "AMBIGUOUS", "", "LOCALIZED", "LOCALIZED"],
-    )  # fmt: skip
+    )
     assert worst(p, 20) == [3, 2, 1, 4, 0]
     assert worst(p, 2) == [3, 2]
 

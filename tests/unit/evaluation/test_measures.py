@@ -16,7 +16,7 @@ def pose(x, y, heading_deg=0.0):
 
 
 def make_predictions(errors_m, *, answered=None, street_answer=None, street_true=None, turns_deg=None):
-    """Queries 100 m apart along x, each answered ``errors_m`` to the side; NaN for no answer at all."""
+    """Return predictions for queries 100 m apart along x, with lateral errors ``errors_m``. NaN means no answer."""
     count = len(errors_m)
     T_true = np.stack([pose(100.0 * k, 0.0) for k in range(count)])
     turns = np.zeros(count) if turns_deg is None else turns_deg
@@ -26,12 +26,19 @@ def make_predictions(errors_m, *, answered=None, street_answer=None, street_true
     ranked = np.full((count, RANKED, 2), np.nan)
     ranked[:, 0] = T_answer[:, :2, 3]
     return Predictions(
-        T_true, T_answer, np.zeros(count, int) if street_true is None else np.array(street_true),
-        np.zeros(count, int) if street_answer is None else np.array(street_answer), ranked, np.full((count, RANKED), -1),
+        T_true,
+        T_answer,
+        np.zeros(count, int) if street_true is None else np.array(street_true),
+        np.zeros(count, int) if street_answer is None else np.array(street_answer),
+        ranked,
+        np.full((count, RANKED), -1),
         np.where(~nothing if answered is None else np.array(answered), "LOCALIZED", ""),
-        np.full(count, np.nan), np.full((count, len(FEATURES)), np.nan),
-        np.full((count, 6, 6), np.nan), np.full(count, 20.0), np.arange(float(count)),
-    )  # fmt: skip
+        np.full(count, np.nan),
+        np.full((count, len(FEATURES)), np.nan),
+        np.full((count, 6, 6), np.nan),
+        np.full(count, 20.0),
+        np.arange(float(count)),
+    )
 
 
 def test_shares_within_distances_count_all_queries():

@@ -32,7 +32,7 @@ def test_without_errors_the_odometry_is_the_truth(frames, monkeypatch):
 
 
 def test_the_odometry_errs_by_a_hundredth_of_the_way_and_a_fifth_of_a_degree(frames):
-    """The first step back, 400 times over."""
+    """The first step back, repeated 400 times."""
     truth = inverse(frames[-1].T_map_camera) @ frames[-2].T_map_camera
     way_m = np.linalg.norm(truth[:3, 3])
     steps = [as_query(frames[-2:], np.random.default_rng(seed), grid=GRID, ranked=3)[1][1] for seed in range(400)]

@@ -1,4 +1,4 @@
-"""Paired differences and how sure they are."""
+"""Paired differences and their confidence intervals."""
 
 import numpy as np
 import pytest
@@ -56,7 +56,7 @@ def test_errors_are_compared_where_both_answered():
     assert found.mean_interval_m == (0.5, 0.5)
 
 
-def test_the_bootstrap_is_as_wide_as_the_standard_error_says_and_the_same_each_time():
+def test_the_bootstrap_interval_matches_the_standard_error_and_is_repeatable():
     rng = np.random.default_rng(1)
     first, second = rng.random(200), rng.random(200)
     found = paired_errors(first, second)

@@ -84,13 +84,13 @@ def test_a_set_without_truth_is_refused(localizer, own_dataset):
         predict(localizer, own_dataset, NAME)
 
 
-def test_progress_is_told_for_every_query(localizer, small_dataset):
+def test_progress_is_reported_for_every_query(localizer, small_dataset):
     told = []
     predict(localizer, small_dataset, NAME, report=lambda *event: told.append(event))
     assert told == [(f"queries {NAME}", k, 5) for k in range(1, 6)]
 
 
-def test_a_prior_is_drawn_from_each_querys_truth_with_chance_of_its_own(localizer, small_dataset):
+def test_each_query_has_a_random_prior_around_its_ground_truth(localizer, small_dataset):
     told = []
 
     def prior_of(T_map_camera, rng):

@@ -15,7 +15,7 @@ def views(seed, count=5, shape=(4, 6)):
 
 
 def slow_similarity(setting, query, view):
-    """One pair, cell by cell."""
+    """Compute one pair, cell by cell."""
     a, b = query.reshape(-1).astype(float), view.reshape(-1).astype(float)
     both, cells = [(x, y) for x, y in zip(a, b, strict=True) if x > 0 and y > 0], len(a)
     if setting.startswith("masked"):
@@ -52,7 +52,7 @@ def test_views_that_share_too_few_cells_are_not_compared():
     assert similarities(one, other)["masked_l2"][0, 0] == -1e3
 
 
-def test_each_nth_query_is_asked_where_that_is_wanted(best, small_map, small_dataset):
+def test_every_nth_query_is_sent_on_request(best, small_map, small_dataset):
     found = raw_best_views(MapBundle.open(small_map), small_dataset, ["drive1_precise"], every=2)
     for setting, numbers in found.items():
         np.testing.assert_array_equal(numbers, best[setting][::2])
@@ -72,7 +72,7 @@ def test_every_query_gets_a_place_of_the_map_by_every_setting(best, small_map):
 
 
 def test_the_best_place_is_that_of_the_most_similar_view_of_all(best, small_map, small_dataset, monkeypatch):
-    """Again with all views in one heap, and again in the smallest pieces."""
+    """Compare with all views in one part, and with the smallest parts."""
     bundle = MapBundle.open(small_map)
     settings = BuildSettings(
         name="small", spacing_m=5.0, headings=6, expected_lidar_height_m=bundle.manifest.lidar_height_m

@@ -1,4 +1,4 @@
-"""A run in a folder."""
+"""A run saved in a folder."""
 
 import json
 import shutil
@@ -20,7 +20,7 @@ def own_run(saved_run, tmp_path):
     return shutil.copytree(saved_run, tmp_path / "own")
 
 
-def test_a_saved_run_says_what_was_asked_of_what(saved_run, small_map, small_dataset):
+def test_a_saved_run_names_its_queries_and_its_map(saved_run, small_map, small_dataset):
     settings = SavedRun.open(saved_run).settings
     assert (settings.map.name, settings.map.version) == ("small", MapBundle.open(small_map).manifest.version)
     assert settings.dataset.path == str(small_dataset.folder.resolve())

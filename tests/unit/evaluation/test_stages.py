@@ -1,4 +1,4 @@
-"""Each stage of an answer against the truth."""
+"""Each stage of an answer against the ground truth."""
 
 import json
 from dataclasses import replace
@@ -15,9 +15,16 @@ from service.maps.reader import MapBundle
 
 NAME = "drive1_precise"
 GOOD = QueryStages(
-    number=0, tilt_deg=0.5, height_error_m=0.1, rank=1, start_m=1.0, candidate_m=0.1, from_truth_m=0.1, error_m=0.1,
+    number=0,
+    tilt_deg=0.5,
+    height_error_m=0.1,
+    rank=1,
+    start_m=1.0,
+    candidate_m=0.1,
+    from_truth_m=0.1,
+    error_m=0.1,
     status="LOCALIZED",
-)  # fmt: skip
+)
 
 
 @pytest.mark.parametrize(

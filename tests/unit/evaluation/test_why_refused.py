@@ -1,4 +1,4 @@
-"""What to check where nearly nothing is accepted: simulated queries that say something wrong of themselves."""
+"""Advice if almost no answer is accepted, for simulated queries with wrong metadata."""
 
 import json
 import shutil
@@ -23,7 +23,7 @@ def localizer(small_map):
 
 @pytest.fixture
 def told_wrong(small_dataset, tmp_path):
-    """The small dataset whose description says other intrinsics or another unit of depth than is true."""
+    """Return the small dataset with a description that has wrong intrinsics or a wrong depth unit."""
 
     def made(*, focal=1.0, depth=1.0):
         folder = shutil.copytree(small_dataset.folder, tmp_path / f"{focal}-{depth}")
@@ -59,7 +59,7 @@ def test_right_intrinsics_and_units_are_not_suspected(localizer, small_dataset):
     assert causes(localizer, *refused(localizer, small_dataset)) == []
 
 
-def test_where_enough_is_accepted_nothing_is_said(localizer, small_dataset):
+def test_with_enough_accepted_answers_there_is_no_advice(localizer, small_dataset):
     frames, answers = refused(localizer, small_dataset)
     answers.status[:] = "LOCALIZED"
     assert causes(localizer, frames, answers) == []
@@ -67,10 +67,10 @@ def test_where_enough_is_accepted_nothing_is_said(localizer, small_dataset):
 
 def test_evidence_out_of_range_is_named_in_the_order_of_likelihood(calibration_of):
     calibration = calibration_of()
-    evidence = np.tile(np.array(calibration.right.mean), (5, 1))
+    evidence = np.tile([each.mean for each in calibration.features], (5, 1))
     assert out_of_range(calibration, evidence) == []
     for name in ("margin", "log_noise", "through"):
-        evidence[:, FEATURES.index(name)] += 5 * calibration.right.spread[FEATURES.index(name)]
+        evidence[:, FEATURES.index(name)] += 5 * calibration.features[FEATURES.index(name)].std
     told = out_of_range(calibration, evidence)
     assert [each.what.split(" (")[0] for each in told] == ["baseline", "traffic in the map", "calibration"]
     assert "log_noise +5.0" in told[0].what

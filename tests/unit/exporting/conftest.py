@@ -1,4 +1,4 @@
-"""A small dataset whose every number was chosen here."""
+"""A small dataset in which we chose every number."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""A dataset written in another tool's format, and imported again."""
+"""A dataset that is written in another format and imported again."""
 
 from functools import partial
 
@@ -92,11 +92,13 @@ def test_pictures_come_after_the_survey_in_time(dataset):
     assert [moment.frame is None for moment in moments(dataset, "drive")] == [True] * 4 + [False] * 3
 
 
-def test_what_is_there_already_is_left_alone(dataset, tmp_path):
+def test_existing_output_is_not_changed(dataset, tmp_path):
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "file").write_text("keep")
-    for write in (lambda: write_bag(dataset, None, tmp_path / "mine", kind="mcap", report=quiet),
-                  lambda: write_kitti_raw(dataset, None, tmp_path / "mine", report=quiet)):  # fmt: skip
+    for write in (
+        lambda: write_bag(dataset, None, tmp_path / "mine", kind="mcap", report=quiet),
+        lambda: write_kitti_raw(dataset, None, tmp_path / "mine", report=quiet),
+    ):
         with pytest.raises(DatasetError, match="choose another"):
             write()
     assert [p.name for p in (tmp_path / "mine").iterdir()] == ["file"]

@@ -18,7 +18,7 @@ positions = st.tuples(st.floats(-3e4, 3e4), st.floats(-3e4, 3e4), st.floats(-500
 
 
 def turned_deg(one, other):
-    """From one longitude to the other, the shorter way round."""
+    """Return the difference of two longitudes, the shorter way round, degrees."""
     return (other - one + 180) % 360 - 180
 
 
@@ -29,7 +29,7 @@ def turned_deg(one, other):
 )  # fmt: skip
 @pytest.mark.parametrize("longitude_deg", [0.0, 13.4, -180.0])
 def test_a_degree_is_as_long_as_the_tables_say(latitude_deg, of_latitude_m, of_longitude_m, longitude_deg):
-    """Lengths of a degree on WGS-84, metres; measured over a hundredth of one, half of it either way."""
+    """Lengths of a degree on WGS-84, metres, measured over a hundredth of a degree."""
     latitude_deg = float(latitude_deg)
     earth = Georeference(latitude_deg, longitude_deg)
     ends = [earth.to_map(latitude_deg + half, longitude_deg, 0.0) for half in (-0.005, 0.005)]
@@ -58,7 +58,7 @@ def test_the_earths_axes_are_where_they_are(origin, place, expected):
     np.testing.assert_allclose(found, expected, atol=1e-3)
 
 
-def test_what_lies_north_of_here_has_the_same_longitude_and_what_lies_a_kilometre_up_too():
+def test_points_north_of_or_above_the_origin_have_the_same_longitude():
     earth = Georeference(52.52, 13.405, 34.0)
     latitude, longitude, height = earth.to_earth(np.array([0.0, 1000.0, 0.0]))
     assert longitude == pytest.approx(13.405, abs=1e-9)
@@ -91,7 +91,7 @@ def test_there_and_back_again_in_metres(earth, position_m):
 
 @given(origins, latitudes, longitudes, heights)
 def test_there_and_back_again_in_degrees(earth, latitude_deg, longitude_deg, height_m):
-    """However far from the origin; at the pole every longitude is right."""
+    """Holds at any distance from the origin. At the pole every longitude is right."""
     found = earth.to_earth(earth.to_map(latitude_deg, longitude_deg, height_m))
     assert found[0] == pytest.approx(latitude_deg, abs=1e-8)
     assert found[2] == pytest.approx(height_m, abs=1e-4)
@@ -109,7 +109,7 @@ def test_the_origin_is_the_origin(earth):
 
 @given(origins, positions, positions)
 def test_distances_are_those_of_the_earth_whatever_the_origin(earth, one, other):
-    """Another origin sees the same two places as far apart."""
+    """With another origin, the distance of the same two places is the same."""
     elsewhere = Georeference(-33.0, 151.0, 5.0)
     seen = [elsewhere.to_map(*earth.to_earth(position)) for position in (one, other)]
     assert np.linalg.norm(seen[1] - seen[0]) == pytest.approx(np.linalg.norm(other - one), abs=1e-5)
@@ -127,7 +127,7 @@ def test_distances_are_those_of_the_earth_whatever_the_origin(earth, one, other)
         ((0.0, 0.0, np.nan), "height_m: nan is not between -100000 and 100000"),
     ],
 )
-def test_what_is_no_place_is_refused_by_name(given, message):
+def test_an_invalid_place_is_refused_by_name(given, message):
     with pytest.raises(ValueError, match="is not between") as error:
         Georeference(*(float(x) for x in given))
     assert str(error.value) == message

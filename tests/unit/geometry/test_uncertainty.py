@@ -9,7 +9,7 @@ vectors = st.tuples(*[st.floats(-1e4, 1e4)] * 3).map(np.array)
 
 @given(lever=vectors, spread=st.integers(0, 1000))
 def test_covariance_is_carried_along_a_body_as_small_motions_are(lever, spread):
-    """A spread of six small motions of the body: the other point is moved by each of them, and by its turn times the lever."""
+    """Six small motions move the body. The other point moves by each translation, and by its rotation times the lever arm."""
     motions = np.random.default_rng(spread).normal(size=(6, 6))
     moved = np.c_[motions[:, :3] + np.cross(motions[:, 3:], lever), motions[:, 3:]]
     at = np.array([3.0, -2.0, 1.0])

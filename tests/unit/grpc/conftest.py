@@ -1,4 +1,4 @@
-"""A gRPC server of the test's own engine, on loopback."""
+"""A gRPC server of the engine under test, on loopback."""
 
 from collections.abc import Iterator
 

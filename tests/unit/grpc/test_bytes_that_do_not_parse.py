@@ -1,4 +1,4 @@
-"""Bytes that are no message of ours end a call as any bad request does, whichever call, and whichever part of the bytes."""
+"""Bytes that are no valid message end a call like any invalid request, for every call and every part of the message."""
 
 import logging
 import threading
@@ -30,7 +30,7 @@ SECRET = b"s3cret"
 
 
 def field(number: int, content: bytes) -> bytes:
-    """A length-delimited field; of numbers below 16 and contents below 128 bytes."""
+    """Encode a length-delimited field. The number is below 16, the content below 128 bytes."""
     assert number < 16
     assert len(content) < 128
     return bytes([number << 3 | 2, len(content)]) + content
@@ -66,7 +66,7 @@ def test_the_innermost_field_that_does_not_parse_is_named(message: Any, raw: byt
     assert "s3cret" not in caught.value.message
 
 
-def test_what_parses_is_parsed() -> None:
+def test_valid_bytes_are_parsed() -> None:
     message = pb.LocalizeRequest(map="tiny", rgb=b"\xff" * 200, camera=CAMERA, options=pb.Options(refine=False))
     assert parsed(message.SerializeToString(), REQUEST) == message
     unknown = field(15, NONE)  # of a later contract
@@ -74,7 +74,7 @@ def test_what_parses_is_parsed() -> None:
 
 
 def test_the_search_for_the_field_ends_in_a_message_of_very_many() -> None:
-    """Two bytes a field: a message of 40 MiB would else be searched for half a minute."""
+    """Each field has two bytes. Without a limit, the search in a message of 40 MiB takes half a minute."""
     inner = field(4, b"") * 1_000_000 + field(4, CUT)
     raw = b"\x0a" + _varint_of(len(inner)) + inner
     with pytest.raises(RequestError) as caught:
@@ -94,7 +94,7 @@ def served(bundle_path: Path) -> Iterator[tuple[Engine, grpc.Channel]]:
 
 
 def counted(engine: Engine, method: str, *, code: str = "request") -> float:
-    """Calls of a method that ended so, by the metrics."""
+    """Return how many calls of a method ended with a code, by the metrics."""
     name = f'streetfix_requests_total{{code="{code}",face="grpc",method="{method}"}} '
     lines = engine.metrics.text().decode().splitlines()
     return sum(float(line.removeprefix(name)) for line in lines if line.startswith(name))
@@ -151,9 +151,9 @@ def test_a_good_frame_before_a_bad_one_is_answered(served: Any, parts_of: Any) -
     _, channel = served
     parts = parts_of()
     good = pb.LocalizeStreamRequest(frame=pb.LocalizeRequest(rgb=parts["rgb"], depth=parts["depth"], camera=CAMERA))
-    answers = channel.stream_stream(f"/{SERVICE}/LocalizeStream", response_deserializer=pb.LocalizeStreamResponse.FromString)(
-        iter([good.SerializeToString(), field(2, CUT)]), timeout=20
-    )  # fmt: skip
+    answers = channel.stream_stream(
+        f"/{SERVICE}/LocalizeStream", response_deserializer=pb.LocalizeStreamResponse.FromString
+    )(iter([good.SerializeToString(), field(2, CUT)]), timeout=20)
     assert next(answers).frames == 1
     with pytest.raises(grpc.RpcError) as caught:
         next(answers)

@@ -1,4 +1,4 @@
-"""What a gRPC client sees when something is wrong."""
+"""The errors that a gRPC client receives."""
 
 import io
 import threading
@@ -53,7 +53,7 @@ def request_of(parts_of: Parts) -> Callable[..., pb.LocalizeRequest]:
 
 
 def details(error: Any) -> dict[str, Any]:
-    """The details of a refused call by their type."""
+    """Return the details of a refused call by type."""
     kinds = {
         "ErrorInfo": error_details_pb2.ErrorInfo,
         "BadRequest": error_details_pb2.BadRequest,
@@ -84,7 +84,7 @@ def details(error: Any) -> dict[str, Any]:
         ({"prior": pb.Prior(wgs84=pb.PriorWgs84(latitude_deg=1))}, grpc.StatusCode.INVALID_ARGUMENT, "request", "prior.wgs84"),
     ],
 )  # fmt: skip
-def test_a_bad_request_is_told_in_details(
+def test_an_invalid_request_has_error_details(
     stub: LocalizationServiceStub, request_of: Any, changed: dict[str, Any], code: Any, reason: str, field: str | None
 ) -> None:
     with pytest.raises(grpc.RpcError) as caught:
@@ -101,7 +101,7 @@ def test_a_bad_request_is_told_in_details(
     assert "RetryInfo" not in found
 
 
-def test_a_depth_in_millimetres_is_told_with_its_scale(
+def test_a_depth_in_millimetres_is_reported_with_its_scale(
     stub: LocalizationServiceStub, request_of: Any, pictures: Any
 ) -> None:
     np.save(file := io.BytesIO(), pictures[1] * np.float32(1000))
@@ -128,7 +128,7 @@ def test_a_message_beyond_the_limit_is_refused(stub: LocalizationServiceStub, re
 def test_a_message_may_be_as_long_as_both_limits_say(
     bundle_path: Path, request_of: Any, limits: Limits, accepted: bool
 ) -> None:
-    """The same good request of about 10 KiB."""
+    """The same valid request of about 10 KiB."""
     assert 1024 < request_of().ByteSize() < 2**20
     engine = Engine.open(Settings(maps=(bundle_path,), threads=1, limits=limits))
     server = GrpcServer(engine, host="127.0.0.1", port=0)
@@ -155,7 +155,7 @@ def test_a_batch_of_none_or_of_too_many_is_refused(stub: LocalizationServiceStub
 
 @pytest.fixture
 def held(engine: Engine) -> Iterator[threading.Event]:
-    """The only worker is busy until the event is set."""
+    """Keep the only worker busy until the event is set."""
     release, began = threading.Event(), threading.Event()
 
     def hold() -> None:
@@ -168,7 +168,7 @@ def held(engine: Engine) -> Iterator[threading.Event]:
     release.set()
 
 
-def test_beyond_the_queue_a_call_is_refused_at_once_and_told_when_to_try_again(
+def test_beyond_the_queue_a_call_is_refused_at_once_with_a_retry_time(
     stub: LocalizationServiceStub, request_of: Any, engine: Engine, held: threading.Event
 ) -> None:
     waiting = engine.admission.submit(lambda: None)
@@ -202,14 +202,14 @@ def test_work_whose_deadline_has_passed_is_dropped(
     assert later.result(10) == "ran"
 
 
-def test_work_whose_caller_has_gone_is_dropped(
+def test_work_without_a_caller_is_dropped(
     stub: LocalizationServiceStub,
     request_of: Any,
     engine: Engine,
     held: threading.Event,
     caplog: pytest.LogCaptureFixture,
 ) -> None:
-    """The place in the queue comes back while the worker is still busy."""
+    """The queue slot is free again while the worker is still busy."""
     call = stub.Localize.future(request_of())
     assert became(lambda: engine.admission.waiting == 1, within_s=10)
     call.cancel()
@@ -262,7 +262,7 @@ def test_a_stream_stays_with_its_map(stub: LocalizationServiceStub, request_of: 
     assert (first.frames, third.frames) == (1, 1)
 
 
-def test_what_nobody_foresaw_tells_the_request_id_and_no_more(
+def test_an_unexpected_error_contains_the_request_id_only(
     stub: LocalizationServiceStub, request_of: Any, engine: Engine, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def fails(_: object) -> None:
@@ -291,7 +291,7 @@ def test_health_follows_readiness(channel: grpc.Channel, engine: Engine) -> None
 
 
 def test_health_is_not_watched(channel: grpc.Channel) -> None:
-    """A watcher would hold a thread without a key, and the ready-made servicer's lock while it does not read."""
+    """A watcher would hold a thread without a key. It would also hold the lock of the standard servicer while it does not read."""
     with pytest.raises(grpc.RpcError) as caught:
         next(health_pb2_grpc.HealthStub(channel).Watch(health_pb2.HealthCheckRequest()))
     assert caught.value.code() == grpc.StatusCode.UNIMPLEMENTED
@@ -315,12 +315,12 @@ def test_a_port_that_is_taken_is_named(engine: Engine) -> None:
 
 
 def raw_call(channel: grpc.Channel, name: str) -> Any:
-    """A call whose messages are bytes of the test's own."""
+    """Make a call with raw bytes as messages."""
     return channel.stream_unary(f"/{SERVICE}/{name}", bytes, bytes)
 
 
 def test_a_message_that_is_many_little_ones_is_refused_unparsed(channel: grpc.Channel) -> None:
-    """50,000 empty requests of two bytes each would be a hundred times as large in memory."""
+    """50,000 empty requests of two bytes each would take a hundred times their size in memory."""
     with pytest.raises(grpc.RpcError) as caught:
         raw_call(channel, "LocalizeBatch")(iter([b"\x0a\x00" * 50_000]))
     assert caught.value.code() == grpc.StatusCode.INVALID_ARGUMENT
@@ -335,7 +335,7 @@ def test_bytes_that_are_no_message_are_refused(channel: grpc.Channel, raw: bytes
 
 
 def test_a_call_that_never_sends_its_message_is_ended(channel: grpc.Channel, stub: LocalizationServiceStub) -> None:
-    """More of them than there are threads, and then others are answered again (the service waits two seconds)."""
+    """More such calls than threads end, and then other calls are answered. The service waits two seconds."""
     silence = threading.Event()
 
     def silent() -> Iterator[bytes]:
@@ -346,7 +346,7 @@ def test_a_call_that_never_sends_its_message_is_ended(channel: grpc.Channel, stu
     assert all(call.exception(timeout=20) is not None for call in calls)
 
     def answered() -> bool:
-        """The client hears of the end a moment before the server has given the call's place back."""
+        """Wait for an answer: the client sees the end shortly before the server frees the slot of the call."""
         try:
             return stub.ListMaps(pb.ListMapsRequest(), timeout=10).maps[0].name == "tiny"
         except grpc.RpcError as error:

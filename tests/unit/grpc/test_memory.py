@@ -1,4 +1,4 @@
-"""Messages within the budget of memory, over gRPC."""
+"""The memory budget of messages, over gRPC."""
 
 import gc
 import threading
@@ -105,7 +105,7 @@ def test_a_message_that_does_not_fit_is_refused_with_when_to_come_back(
 def test_no_more_messages_are_read_at_once_than_there_is_memory_for(
     engine: Engine, channel: grpc.Channel, stub: LocalizationServiceStub, message: pb.LocalizeRequest
 ) -> None:
-    """Calls that never send their message keep their turn while they live."""
+    """Calls that never send their message keep their turn until they end."""
     over = threading.Event()
 
     def silent() -> Iterator[bytes]:
@@ -136,7 +136,7 @@ def test_no_more_messages_are_read_at_once_than_there_is_memory_for(
 
 
 def test_health_is_answered_while_others_hold_its_turn_and_send_nothing(channel: grpc.Channel) -> None:
-    """It needs no key, so nobody may keep probes from their answer."""
+    """Health checks need no key, so no caller may block them."""
     over = threading.Event()
 
     def silent() -> Iterator[bytes]:
@@ -153,7 +153,7 @@ def test_health_is_answered_while_others_hold_its_turn_and_send_nothing(channel:
 
 
 def test_reflection_reads_one_message_at_a_time(channel: grpc.Channel) -> None:
-    """Its messages are not weighed, so a hundred large ones must not be read side by side."""
+    """Reflection messages have no reservation. So the service must not read a hundred large ones at once."""
     over = threading.Event()
 
     def silent() -> Iterator[bytes]:

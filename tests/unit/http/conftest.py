@@ -12,7 +12,7 @@ from service.runtime.settings import Limits, Settings
 
 
 class AppTransport(httpx.BaseTransport):
-    """Calls an application in place of a socket, so that a plain httpx.Client can talk to it."""
+    """Calls an application without a socket, so a plain httpx.Client can use it."""
 
     def __init__(self, app: FastAPI) -> None:
         self._transport = httpx.ASGITransport(app, raise_app_exceptions=False)
@@ -31,7 +31,7 @@ class AppTransport(httpx.BaseTransport):
 
 @pytest.fixture(scope="session")
 def app_client() -> Callable[[FastAPI], httpx.Client]:
-    """A client of an application."""
+    """Return a client of an application."""
     return lambda app: httpx.Client(transport=AppTransport(app), base_url="http://127.0.0.1")
 
 

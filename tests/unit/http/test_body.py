@@ -20,7 +20,7 @@ def part(name: str, content: bytes) -> bytes:
 
 
 @given(st.dictionaries(st.sampled_from(["rgb", "depth", "request", "more"]), st.binary(max_size=300), min_size=1))
-def test_what_httpx_builds_is_read_back(parts: dict[str, bytes]) -> None:
+def test_a_body_from_httpx_is_read_back(parts: dict[str, bytes]) -> None:
     request = httpx.Request("POST", "http://x", files={name: (name, data) for name, data in parts.items()})
     assert split(request.read(), request.headers["content-type"]) == parts
 
@@ -49,9 +49,13 @@ def test_another_content_type_is_unsupported(content_type: str) -> None:
 
 @pytest.mark.parametrize(
     "content_type",
-    ["multipart/form-data", "multipart/form-data; boundary=", f"multipart/form-data; boundary={'x' * 71}",
-     "multipart/form-data; boundary*=utf-8''XX"],
-)  # fmt: skip
+    [
+        "multipart/form-data",
+        "multipart/form-data; boundary=",
+        f"multipart/form-data; boundary={'x' * 71}",
+        "multipart/form-data; boundary*=utf-8''XX",
+    ],
+)
 def test_a_content_type_without_a_valid_boundary_is_refused(content_type: str) -> None:
     with pytest.raises(RequestError, match="no valid boundary"):
         split(part("a", b"1") + b"--XX--", content_type)

@@ -1,4 +1,4 @@
-"""The console's routes: what they answer, to whom, and that they can be switched off."""
+"""The routes of the console: their answers, their access rules, and the setting that disables them."""
 
 import json
 from collections.abc import Callable, Iterator
@@ -99,12 +99,12 @@ def test_cloud_and_places_are_binary(client: httpx.Client) -> None:
         ("/v1/answers?most=0", 422),
     ],
 )
-def test_what_makes_no_sense_is_a_problem(client: httpx.Client, path: str, status: int) -> None:
+def test_an_invalid_path_or_parameter_is_a_problem(client: httpx.Client, path: str, status: int) -> None:
     response = client.get(path)
     assert (response.status_code, response.headers["content-type"]) == (status, "application/problem+json")
 
 
-def test_samples_are_listed_and_asked(client: httpx.Client, parts_of: Parts) -> None:
+def test_samples_are_listed_and_sent(client: httpx.Client, parts_of: Parts) -> None:
     (sample,) = client.get("/v1/samples").json()["samples"]
     rgb, depth = (client.get(f"/v1/{sample[part]}") for part in ("rgb", "depth"))
     assert (rgb.headers["content-type"], rgb.content) == ("image/png", parts_of()["rgb"])
@@ -125,8 +125,17 @@ def test_the_last_answers_hold_figures_alone(client: httpx.Client, parts_of: Par
     newest = client.get("/v1/answers?most=1").json()["answers"]
     assert len(newest) == 1
     assert set(newest[0]) == {
-        "number", "at", "map", "status", "confidence", "street", "position", "heading_deg", "frames", "total_ms",
-    }  # fmt: skip
+        "number",
+        "at",
+        "map",
+        "status",
+        "confidence",
+        "street",
+        "position",
+        "heading_deg",
+        "frames",
+        "total_ms",
+    }
     assert newest[0]["street"] == "End of street 2"
 
 

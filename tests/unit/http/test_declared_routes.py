@@ -1,4 +1,4 @@
-"""Every route is declared once: what is added to its declaration holds for what it answers."""
+"""Every route is declared once, and its responses match the declaration."""
 
 from collections.abc import Callable
 from functools import partial
@@ -9,7 +9,7 @@ from fastapi import APIRouter, Depends, FastAPI
 
 from service.errors import BusyError, ForbiddenError
 from service.http.app import create_app
-from service.http.body import Asking
+from service.http.body import RequestRunner
 from service.http.routes import localize
 from service.runtime.engine import Engine
 
@@ -36,13 +36,13 @@ def test_a_dependency_of_a_localizing_route_is_honoured(
 @pytest.mark.parametrize(
     ("error", "status", "code"), [(BusyError("full"), 503, "busy"), (ZeroDivisionError(), 500, "internal")]
 )
-def test_what_a_localizing_route_raises_is_a_problem_and_is_counted_by_its_name(
+def test_an_error_of_a_localizing_route_is_a_problem_and_is_counted_by_name(
     engine: Engine, app_client: AppClient, monkeypatch: pytest.MonkeyPatch, error: Exception, status: int, code: str
 ) -> None:
     async def fails(*_: object) -> None:
         raise error
 
-    monkeypatch.setattr(Asking, "__call__", fails)
+    monkeypatch.setattr(RequestRunner, "__call__", fails)
     before = count(engine, status)
     answer = app_client(create_app(engine)).post("/v1/localize", content=b"x")
     assert (answer.status_code, answer.json()["code"]) == (status, code)

@@ -1,6 +1,6 @@
-"""Every number that a request may hold has bounds, and at them, beside them and beyond them the service answers or refuses clearly.
+"""Every number of a request has bounds. At, beside and beyond them, the service answers or refuses with a clear error.
 
-The values are read off the OpenAPI document and the proto, so that a new field cannot be left out.
+The fields come from the OpenAPI document and the proto file, so a new field is tested too.
 """
 
 import io
@@ -37,7 +37,7 @@ AHEAD = {"position": {"x": 0.1, "y": 0.0, "z": 1.0}, "orientation": {"x": 0.0, "
 
 @dataclass(frozen=True)
 class Number:
-    """A number of a request: where it stands and what its schema says."""
+    """A number of a request: its path and its schema."""
 
     path: Path_
     schema: Json
@@ -47,12 +47,13 @@ class Number:
         return ".".join(str(part) for part in self.path)
 
     def extremes(self) -> list[tuple[float, bool]]:
-        """Values at both bounds and just outside, and whether each is within."""
+        """Return values at both bounds and just outside, with whether each is valid."""
         whole = self.schema["type"] == "integer"
         found: list[tuple[float, bool]] = []
         for bound, exclusive, outwards in (
-            ("minimum", "exclusiveMinimum", -math.inf), ("maximum", "exclusiveMaximum", math.inf),
-        ):  # fmt: skip
+            ("minimum", "exclusiveMinimum", -math.inf),
+            ("maximum", "exclusiveMaximum", math.inf),
+        ):
             if exclusive in self.schema:
                 edge = self.schema[exclusive]
                 inside = edge - math.copysign(1, outwards) if whole else math.nextafter(edge, -outwards)
@@ -68,7 +69,7 @@ DOCUMENT: Json = json.loads(openapi_text())
 
 
 def resolved(schema: Json) -> list[Json]:
-    """The alternatives of a schema, references followed."""
+    """Return the alternatives of a schema, with references resolved."""
     if "$ref" in schema:
         node: Any = DOCUMENT
         for key in schema["$ref"].removeprefix("#/").split("/"):
@@ -90,7 +91,7 @@ def numbers_in(schema: Json, path: Path_ = ()) -> Iterator[Number]:
 
 
 def request_schemas() -> dict[str, Json]:
-    """The JSON documents of all request bodies, and all parameters, by operation."""
+    """Return the JSON schemas of all request bodies and parameters, by operation."""
     found: dict[str, Json] = {}
     for operations in DOCUMENT["paths"].values():
         for operation in operations.values():
@@ -103,7 +104,7 @@ def request_schemas() -> dict[str, Json]:
 
 
 def of(name: str) -> list[Number]:
-    """Of a component of the document."""
+    """Return a component of the document."""
     return list(numbers_in({"$ref": f"#/components/schemas/{name}"}))
 
 
@@ -129,7 +130,7 @@ def client(
     client_of: Callable[[Engine], httpx.Client],
     tmp_path_factory: pytest.TempPathFactory,
 ) -> Iterator[httpx.Client]:
-    """Of a georeferenced, calibrated map."""
+    """Return a client of a georeferenced, calibrated map."""
     folder = tmp_path_factory.mktemp("extremes") / "tiny"
     georeference = {"latitude_deg": 52.52, "longitude_deg": 13.405, "height_m": 70.0}
     write_bundle(folder, content_of(georeference=georeference, calibration=calibration_json()))
@@ -139,7 +140,7 @@ def client(
 
 
 def full_request(parts_of: Parts, prior: str = "position") -> Json:
-    """Every optional number said; ``prior`` is position or wgs84."""
+    """Return a request with every optional number. ``prior`` is position or wgs84."""
     document: Json = json.loads(parts_of()["request"])
     where = {
         "position": {"x": 20, "y": 100, "std_m": 5},
@@ -147,15 +148,16 @@ def full_request(parts_of: Parts, prior: str = "position") -> Json:
     }
     return document | {
         "depth": {"scale_m": 1, "kind": "z", "max_range_m": 80, "baseline_m": 0.12},
-        "gravity": {"x": 0.01, "y": 1, "z": 0.01}, "T_vehicle_camera": AHEAD,
+        "gravity": {"x": 0.01, "y": 1, "z": 0.01},
+        "T_vehicle_camera": AHEAD,
         "camera": document["camera"] | {"height_m": 1.5, "height_std_m": 0.05},
         "prior": {prior: where[prior], "heading_deg": 90, "heading_std_deg": 20},
         "options": {"neighbours": 5, "refine": True, "false_accept_rate": 0.02},
-    }  # fmt: skip
+    }
 
 
 def changed(document: Json, path: Path_, value: float) -> Json:
-    """A copy with one value set, whatever has to be made on the way to it."""
+    """Return a copy with one value set; missing parents are created."""
     copy = json.loads(json.dumps(document))
     node: Any = copy
     for key, below in zip(path, (*path[1:], None), strict=True):
@@ -180,7 +182,7 @@ def npy_of(depth: Any) -> bytes:
 
 
 def depths(parts_of: Parts) -> dict[str, bytes]:
-    """Pictures that statistics of measurements may vanish on."""
+    """Return depth images for which statistics may be undefined."""
     u = np.linspace(0.5, 1.5, 64, dtype=np.float32) * np.ones((48, 1), np.float32)
     return {
         "as it is": parts_of()["depth"],
@@ -190,12 +192,14 @@ def depths(parts_of: Parts) -> dict[str, bytes]:
         "integers": npy_of((1000 * u).astype(np.uint16)),
         "largest": npy_of(np.full((48, 64), 3e38, np.float32)),
         "smallest": npy_of(np.full((48, 64), 1e-45, np.float32)),
-        "not finite": npy_of(np.where(np.arange(64) % 2, np.inf, np.nan).astype(np.float32) * np.ones((48, 1), np.float32)),
-    }  # fmt: skip
+        "not finite": npy_of(
+            np.where(np.arange(64) % 2, np.inf, np.nan).astype(np.float32) * np.ones((48, 1), np.float32)
+        ),
+    }
 
 
 def finite(value: Any) -> bool:
-    """Whether all numbers of a document are; Python's parser takes NaN, which is no JSON."""
+    """Return whether all numbers of a document are finite. Python's parser accepts NaN, which JSON does not have."""
     if isinstance(value, dict):
         return all(finite(each) for each in value.values())
     if isinstance(value, list):
@@ -261,7 +265,7 @@ def test_a_sequence_takes_every_bound_and_names_the_field_beyond_it(
 @given(st.data())
 @settings(max_examples=150, deadline=None, derandomize=True, database=None, suppress_health_check=list(HealthCheck))
 def test_bounds_of_several_fields_at_once(client: httpx.Client, parts_of: Parts, data: st.DataObject) -> None:
-    """Where two extremes meet, a product or a quotient of them may still be no number."""
+    """For two extreme values, a product or a quotient may be infinite or NaN."""
     document = full_request(parts_of, data.draw(st.sampled_from(["position", "wgs84"])))
     document["depth"]["kind"] = data.draw(st.sampled_from(["z", "range", "disparity"]))
     document["options"]["refine"] = data.draw(st.booleans())
@@ -292,19 +296,25 @@ def test_pictures_on_which_a_statistic_vanishes_are_answered_or_refused(
 def test_the_longest_strip_that_is_taken_costs_no_more_than_another_picture(
     client: httpx.Client, parts_of: Parts
 ) -> None:
-    """The map is drawn 80 pixels wide at the picture's aspect: of 2 x 32768 pixels that would be 400 MiB for each pose."""
+    """The map is rendered 80 pixels wide with the aspect of the image. For 2 x 32768 pixels, each pose would take 400 MiB."""
     import cv2
 
     for width, height, taken in ((2, 32, True), (32, 2, True), (2, 33, False), (2, 32768, False)):
         document = full_request(parts_of)
         document["camera"] |= {
-            "width": width, "height": height, "fx": width / 2, "fy": height / 2, "cx": width / 2, "cy": height / 2
-        }  # fmt: skip
+            "width": width,
+            "height": height,
+            "fx": width / 2,
+            "fy": height / 2,
+            "cx": width / 2,
+            "cy": height / 2,
+        }
         size = (max(48, 24 * height // width), max(48, 24 * width // height)) if taken else (8, 8)
         parts = {
             "rgb": cv2.imencode(".png", np.full((*size, 3), 99, np.uint8))[1].tobytes(),
-            "depth": npy_of(np.full(size, 5.0, np.float32)), "request": json.dumps(document).encode(),
-        }  # fmt: skip
+            "depth": npy_of(np.full(size, 5.0, np.float32)),
+            "request": json.dumps(document).encode(),
+        }
         status, answer = posted(client, "/v1/localize", parts)
         assert allowed(status), answer
         assert (answer.get("field") == "camera.height") is not taken
@@ -318,15 +328,18 @@ def test_the_geopose_protocol_takes_every_bound_and_names_the_field_beyond_it(
 
     def reading(name: str, part: str) -> Json:
         return {
-            "sensorId": part, "imageFormat": name, "size": [64, 48],
+            "sensorId": part,
+            "imageFormat": name,
+            "size": [64, 48],
             "imageBytes": base64.b64encode(parts_of()[part]).decode(),
             "params": {"model": "PINHOLE", "modelParams": [32, 32, 32, 24], "minMaxDepth": [0.1, 40]},
             "imageOrientation": {"mirrored": False, "rotation": 0},
-        }  # fmt: skip
+        }
 
     base: Json = {
-        "sensorReadings": {"cameraReadings": [reading("RGBA32", "rgb"), reading("DEPTH", "depth")]}, "priorPoses": [],
-    }  # fmt: skip
+        "sensorReadings": {"cameraReadings": [reading("RGBA32", "rgb"), reading("DEPTH", "depth")]},
+        "priorPoses": [],
+    }
     for value, within in number.extremes():
         document = json.loads(json.dumps(base))
         parts = list(number.path)
@@ -392,9 +405,10 @@ def localize(bundle_path: Path) -> Iterator[Callable[[pb.LocalizeRequest], pb.Lo
     server.start()
     with grpc.insecure_channel(f"127.0.0.1:{server.port}") as channel:
         yield channel.unary_unary(
-            f"/{SERVICE}/Localize", request_serializer=pb.LocalizeRequest.SerializeToString,
+            f"/{SERVICE}/Localize",
+            request_serializer=pb.LocalizeRequest.SerializeToString,
             response_deserializer=pb.LocalizeResponse.FromString,
-        )  # fmt: skip
+        )
     server.stop(grace_s=0)
     engine.close()
 
@@ -407,10 +421,12 @@ def test_a_message_with_a_number_beyond_every_bound_is_refused(
     whole = path[-1] in ("width", "height", "neighbours")
     for value in (0, 2**32 - 1) if whole else BEYOND:
         message = pb.LocalizeRequest(
-            rgb=parts["rgb"], depth=parts["depth"], depth_format=pb.DepthFormat(scale_m=1),
+            rgb=parts["rgb"],
+            depth=parts["depth"],
+            depth_format=pb.DepthFormat(scale_m=1),
             camera=pb.Camera(width=64, height=48, fx=32, fy=32, cx=31.5, cy=23.5),
             vehicle_from_camera=AHEAD if path[0] == "vehicle_from_camera" else None,
-        )  # fmt: skip
+        )
         inside: Message = message
         for name in path[:-1]:
             inside = getattr(inside, name)

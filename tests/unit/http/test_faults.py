@@ -1,4 +1,4 @@
-"""What goes wrong inside one request stays inside it."""
+"""A fault inside one request does not affect others."""
 
 import socket
 import threading
@@ -71,7 +71,7 @@ def test_an_answer_that_is_not_finite_is_an_internal_error_of_both_faces(
     monkeypatch: pytest.MonkeyPatch,
     caplog: pytest.LogCaptureFixture,
 ) -> None:
-    """NaN never reaches a client; the log names the number and the request."""
+    """NaN never reaches a client. The log names the number and the request."""
     parts = parts_of()
     message = pb.LocalizeRequest(
         rgb=parts["rgb"], depth=parts["depth"], camera=pb.Camera(width=64, height=48, fx=32, fy=32, cx=31.5, cy=23.5)
@@ -98,10 +98,10 @@ def test_an_answer_that_is_not_finite_is_an_internal_error_of_both_faces(
         server.stop(grace_s=0)
 
 
-def test_a_stuck_request_is_told_so_and_the_others_are_answered(
+def test_a_stuck_request_gets_an_error_and_the_others_are_answered(
     engine: Engine, client_of: Callable[[Engine], httpx.Client], parts_of: Parts, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """One of two threads hangs in a decoder; its caller waits no longer than a request may take."""
+    """One of two threads hangs in a decoder. Its caller waits no longer than the time limit of a request."""
     client, hangs, goes_on, real = client_of(engine), threading.Event(), threading.Event(), opencv_decode
 
     def stuck(data: bytes, flags: int, *, field: str) -> object:
@@ -121,8 +121,8 @@ def test_a_stuck_request_is_told_so_and_the_others_are_answered(
     assert (found[0].status_code, found[0].json()["code"]) == (504, "deadline")
 
 
-def test_work_whose_caller_has_gone_is_dropped(engine: Engine, parts_of: Parts) -> None:
-    """Over a real socket, which the caller closes while its request waits: the place in the queue comes back at once."""
+def test_work_without_a_caller_is_dropped(engine: Engine, parts_of: Parts) -> None:
+    """The caller closes a real socket while its request waits. The queue slot is free at once."""
     release, hold = threading.Event(), []
     for _ in range(2):
         began = threading.Event()
@@ -157,7 +157,7 @@ def test_work_whose_caller_has_gone_is_dropped(engine: Engine, parts_of: Parts) 
 
 
 def became(true: Callable[[], bool], *, within_s: float = 3.0) -> bool:
-    """Sooner than the five seconds that a request may take."""
+    """Wait until a condition holds, for less than the five seconds of a request."""
     until = time.monotonic() + within_s
     while not true() and time.monotonic() < until:
         time.sleep(0.01)

@@ -1,4 +1,4 @@
-"""The two outside formats, on a georeferenced map over HTTP: OGC GeoPose by negotiation, OSCP by its own route."""
+"""The two external formats over HTTP, on a georeferenced map: OGC GeoPose by negotiation, OSCP by its own route."""
 
 import base64
 import json
@@ -53,7 +53,7 @@ def client(on_earth: Path, client_of: ClientOf) -> Iterator[httpx.Client]:
     ],
 )
 def test_quaternions_known_by_hand(on_earth: Path, heading_deg: float, camera: Any, vehicle: Any) -> None:
-    """At the map's origin, where east, north and up are the map's axes; no other member than the standard's."""
+    """At the map origin, east, north and up are the map axes. The answer has only members of the standard."""
     bundle = MapBundle.open(on_earth)
     body = rotation_z(math.radians(heading_deg))
     for R, expected in ((body @ R_BODY_OPTICAL, camera), (body, vehicle)):
@@ -68,7 +68,7 @@ def test_quaternions_known_by_hand(on_earth: Path, heading_deg: float, camera: A
 
 
 def test_far_from_the_origin_up_is_another(on_earth: Path) -> None:
-    """100 km east of it the ground's normal leans east by 0.90 degrees, and map axes lean back against it."""
+    """100 km east of the origin, the ellipsoid normal leans east by 0.90 degrees. The map axes lean back by the same angle."""
     bundle = MapBundle.open(on_earth)
     found = geopose_of(transform_from(np.eye(3), np.array([100_000.0, 0, 0])), bundle)
     assert found is not None
@@ -102,7 +102,7 @@ def test_with_a_vehicle_the_geopose_is_the_vehicles(client: httpx.Client, parts_
 
 
 def oscp(parts: dict[str, bytes], **changed: Any) -> dict[str, Any]:
-    """As the reference clients send it: floats for times, nulls for what they do not know."""
+    """Return a request like that of the reference clients: float times, and null for unknown values."""
 
     def camera(kind: str, content: bytes) -> dict[str, Any]:
         params = {
@@ -112,9 +112,16 @@ def oscp(parts: dict[str, bytes], **changed: Any) -> dict[str, Any]:
             "minMaxDisparity": None,
         }
         return {
-            "timestamp": 1.7e12, "sensorId": "0", "privacy": None, "sequenceNumber": 0, "imageFormat": kind, "size": [64, 48],
-            "imageBytes": base64.b64encode(content).decode(), "imageOrientation": {"mirrored": False, "rotation": 0}, "params": params,
-        }  # fmt: skip
+            "timestamp": 1.7e12,
+            "sensorId": "0",
+            "privacy": None,
+            "sequenceNumber": 0,
+            "imageFormat": kind,
+            "size": [64, 48],
+            "imageBytes": base64.b64encode(content).decode(),
+            "imageOrientation": {"mirrored": False, "rotation": 0},
+            "params": params,
+        }
 
     readings = {
         "cameraReadings": [camera("RGBA32", parts["rgb"]), camera("DEPTH", parts["depth"])],
@@ -122,8 +129,13 @@ def oscp(parts: dict[str, bytes], **changed: Any) -> dict[str, Any]:
     }
     sensors = [{"id": "0", "type": "camera", "name": None, "model": None, "rigIdentifier": None}]
     return {
-        "id": "mine", "timestamp": 1.7e12 + 0.5, "type": "geopose", "sensors": sensors, "sensorReadings": readings, "priorPoses": [],
-    } | changed  # fmt: skip
+        "id": "mine",
+        "timestamp": 1.7e12 + 0.5,
+        "type": "geopose",
+        "sensors": sensors,
+        "sensorReadings": readings,
+        "priorPoses": [],
+    } | changed
 
 
 def test_a_reference_client_gets_the_same_pose(client: httpx.Client, parts_of: Parts) -> None:
@@ -145,7 +157,7 @@ def test_a_reference_client_gets_the_same_pose(client: httpx.Client, parts_of: P
 def test_the_reference_clients_requests_are_answered_unchanged(
     client: httpx.Client, parts_of: Parts, name: str
 ) -> None:
-    """Of each the request as it writes it, headers included, with a DEPTH reading beside its picture."""
+    """Each reference client's request as it writes it, with headers and a DEPTH reading beside the image."""
     sent = json.loads((GOLDEN / f"{name}.json").read_text())
     parts = parts_of()
     for reading in sent["body"]["sensorReadings"]["cameraReadings"]:
@@ -160,7 +172,7 @@ def test_the_reference_clients_requests_are_answered_unchanged(
     assert told["geopose"]["position"]["lat"] == pytest.approx(expected["lat"], abs=1e-6)
 
 
-def test_rgb_alone_is_told_what_is_missing(client: httpx.Client, parts_of: Parts) -> None:
+def test_a_query_without_depth_is_refused_with_the_missing_part(client: httpx.Client, parts_of: Parts) -> None:
     request = oscp(parts_of())
     del request["sensorReadings"]["cameraReadings"][1]
     refused = client.post("/geopose", json=request, headers=ACCEPT)
@@ -179,16 +191,16 @@ def test_another_version_is_refused(client: httpx.Client, parts_of: Parts, accep
 
 
 @pytest.mark.parametrize("body", [b"", b"[]", b"{", b'{"sensorReadings": 3}', b"[" * 100_000])
-def test_what_is_no_request_is_refused(client: httpx.Client, body: bytes) -> None:
+def test_an_invalid_request_is_refused(client: httpx.Client, body: bytes) -> None:
     refused = client.post("/geopose", content=body, headers=ACCEPT)
     assert (refused.status_code, refused.json()["code"]) == (422, "request")
 
 
-def test_the_protocol_says_that_it_is_there(client: httpx.Client) -> None:
+def test_the_protocol_identifies_itself(client: httpx.Client) -> None:
     assert client.get("/geopose").json()["version"] == "2.0"
 
 
-def test_a_map_without_a_place_on_the_earth_is_told(bundle_path: Path, parts_of: Parts, client_of: ClientOf) -> None:
+def test_a_map_without_georeference_is_reported(bundle_path: Path, parts_of: Parts, client_of: ClientOf) -> None:
     engine = Engine.open(Settings(maps=(bundle_path,), threads=1))
     client = client_of(engine)
     for refused in (
@@ -200,7 +212,7 @@ def test_a_map_without_a_place_on_the_earth_is_told(bundle_path: Path, parts_of:
     engine.close()
 
 
-def test_doubt_is_a_problem_where_the_format_has_no_word_for_it(
+def test_an_uncertain_answer_is_a_problem_in_a_format_without_uncertainty(
     client: httpx.Client, parts_of: Parts, calibration_of: Callable[..., Calibration], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     from service.confidence import decision

@@ -40,13 +40,32 @@ def test_the_answer_has_the_contracts_form(client: httpx.Client, parts_of: Parts
     answer = response.json()
     assert response.status_code == 200
     assert list(answer) == [
-        "status", "confidence", "street", "pose", "vehicle_pose", "geopose", "hypotheses", "spread", "reasons", "neighbours",
-        "camera_height", "calibration", "extrapolated", "map", "timings_ms",
-    ]  # fmt: skip
+        "status",
+        "confidence",
+        "street",
+        "pose",
+        "vehicle_pose",
+        "geopose",
+        "hypotheses",
+        "spread",
+        "reasons",
+        "neighbours",
+        "camera_height",
+        "calibration",
+        "extrapolated",
+        "threshold",
+        "map",
+        "timings_ms",
+    ]
     assert (answer["status"], answer["confidence"], answer["geopose"]) == ("LOCALIZED", None, None)
     assert answer["street"] | {"vote": 1} == {
-        "id": "s2", "name": "End of street 2", "street": "2", "section": "end", "class_index": 2, "vote": 1,
-    }  # fmt: skip
+        "id": "s2",
+        "name": "End of street 2",
+        "street": "2",
+        "section": "end",
+        "class_index": 2,
+        "vote": 1,
+    }
     assert answer["pose"]["position"]["x"] == pytest.approx(20, abs=0.3)
     assert answer["pose"]["heading_deg"] == pytest.approx(90, abs=1)
     assert len(answer["pose"]["covariance"]) == 36
@@ -91,7 +110,7 @@ def test_as_many_neighbours_as_asked_for(client: httpx.Client, parts_of: Parts) 
     assert len(answer["neighbours"]) == 2
 
 
-def test_the_vehicles_pose_is_answered_where_asked_for(client: httpx.Client, parts_of: Parts) -> None:
+def test_the_vehicle_pose_is_returned_on_request(client: httpx.Client, parts_of: Parts) -> None:
     # The camera looks forward, 1 m before and 0.5 m above the vehicle's origin.
     T = {"position": {"x": 1, "y": 0, "z": 0.5}, "orientation": {"x": -0.5, "y": 0.5, "z": -0.5, "w": 0.5}}
     answer = post(client, parts_of(T_vehicle_camera=T)).json()
@@ -181,9 +200,9 @@ def test_an_unknown_map_is_refused_with_the_mounted_ones(client: httpx.Client, p
 def test_every_limit_of_the_settings_refuses_what_is_beyond_it(
     bundle_path: Path, client_of: Callable[[Engine], httpx.Client], parts_of: Parts, name: str
 ) -> None:
-    """The same good request, whose body, pictures and pixels are beyond the least that each limit may be set to.
+    """The same valid request exceeds the smallest value of each limit: body, images and pixels.
 
-    The limit of a gRPC message has its test with the other tests of that face.
+    The tests of gRPC cover the limit of a gRPC message.
     """
     least = {"max_request_bytes": 1024, "max_part_bytes": 1024, "max_pixels": 1}[name]
     engine = Engine.open(Settings(maps=(bundle_path,), threads=1, limits=Limits(**{name: least})))
@@ -203,7 +222,7 @@ def test_no_depth_is_a_problem_of_its_own(client: httpx.Client, parts_of: Parts)
         (0.001, "which looks like metres that were read as millimetres; send depth.scale_m = 1"),
     ],
 )
-def test_a_depth_in_another_unit_is_told_with_its_scale(
+def test_a_depth_in_another_unit_is_reported_with_its_scale(
     client: httpx.Client, parts_of: Parts, pictures: Any, factor: float, told: str
 ) -> None:
     np.save(file := io.BytesIO(), pictures[1] * np.float32(factor))
@@ -264,7 +283,7 @@ def test_a_request_that_is_no_json_object_is_refused(client: httpx.Client, parts
         ({"camera": CAMERA | {"distortion": [0.1, 0, 0, 0]}}, "camera.distortion"),
     ],
 )
-def test_what_this_release_cannot_use_is_refused_and_not_ignored(
+def test_unknown_fields_are_refused_and_not_ignored(
     client: httpx.Client, parts_of: Parts, changed: dict[str, Any], field: str
 ) -> None:
     require_problem(post(client, parts_of(**changed)), 422, "not-yet", field)
@@ -273,9 +292,14 @@ def test_what_this_release_cannot_use_is_refused_and_not_ignored(
 TRUE_PRIOR = {"position": {"x": 20, "y": 100, "std_m": 5}, "heading_deg": 90}
 
 
-@pytest.mark.parametrize("prior", [
-    TRUE_PRIOR, {"heading_deg": -270}, {"position": {"x": 5000, "y": -5000, "std_m": 0.1}, "heading_deg": 270, "heading_std_deg": 1},
-])  # fmt: skip
+@pytest.mark.parametrize(
+    "prior",
+    [
+        TRUE_PRIOR,
+        {"heading_deg": -270},
+        {"position": {"x": 5000, "y": -5000, "std_m": 0.1}, "heading_deg": 270, "heading_std_deg": 1},
+    ],
+)
 def test_a_prior_right_or_wrong_does_not_move_an_answer_that_the_pictures_are_sure_of(
     client: httpx.Client, parts_of: Parts, prior: dict[str, Any]
 ) -> None:
@@ -298,7 +322,7 @@ def test_a_request_id_that_could_forge_a_log_is_replaced(client: httpx.Client, p
     assert len(response.headers["x-request-id"]) == 32
 
 
-def test_what_nobody_foresaw_shows_the_request_id_and_nothing_else(
+def test_an_unexpected_error_shows_the_request_id_only(
     client: httpx.Client,
     engine: Engine,
     parts_of: Parts,
@@ -339,7 +363,7 @@ def test_beyond_the_queue_the_answer_is_busy_with_retry_after(
             future.result(30)
 
 
-def test_a_request_that_takes_too_long_is_told_so(
+def test_a_request_that_takes_too_long_is_reported(
     engine: Engine, parts_of: Parts, client_of: Callable[[Engine], httpx.Client]
 ) -> None:
     hurried = Engine(engine.registry, Settings(threads=1, request_timeout_s=0.05))
@@ -370,11 +394,18 @@ def test_qualities_decide_and_of_equal_ones_the_first(accept: str, expected: boo
     ("changed", "field"),
     [
         ({"vehicle_base_on_ground": True}, "vehicle_base_on_ground"),
-        ({"vehicle_base_on_ground": True, "T_vehicle_camera": {"position": {"x": 0, "y": 0, "z": -1},
-                                                               "orientation": {"x": 0, "y": 0, "z": 0, "w": 1}}},
-         "T_vehicle_camera.position.z"),
+        (
+            {
+                "vehicle_base_on_ground": True,
+                "T_vehicle_camera": {
+                    "position": {"x": 0, "y": 0, "z": -1},
+                    "orientation": {"x": 0, "y": 0, "z": 0, "w": 1},
+                },
+            },
+            "T_vehicle_camera.position.z",
+        ),
     ],
-)  # fmt: skip
+)
 def test_a_vehicle_on_the_ground_without_a_height_is_a_problem_that_names_the_field(
     client: httpx.Client, parts_of: Parts, changed: dict[str, Any], field: str
 ) -> None:

@@ -1,4 +1,4 @@
-"""Bodies and pictures within the budget of memory, over REST."""
+"""The memory budget of bodies and images, over REST."""
 
 import asyncio
 import gc
@@ -35,7 +35,7 @@ def engine(bundle_path: Path) -> Iterator[Engine]:
 
 @pytest.fixture
 def no_collector() -> Iterator[None]:
-    """What lives on now is held by somebody, not only by itself."""
+    """Disable the garbage collector: objects that survive have a reference."""
     gc.collect()
     gc.disable()
     yield
@@ -43,7 +43,7 @@ def no_collector() -> Iterator[None]:
 
 
 def freed(engine: Engine) -> bool:
-    """A worker drops what it had a moment after its caller has the answer."""
+    """Wait until memory is free: a worker frees its objects shortly after the caller has the answer."""
     until = time.monotonic() + 5
     while engine.memory.held:
         if time.monotonic() > until:
@@ -77,7 +77,7 @@ def test_all_is_given_back_after_an_answer_and_after_an_error(
     assert freed(engine)
 
 
-def test_what_does_not_fit_is_refused_before_it_is_read(engine: Engine, app_client: AppClient) -> None:
+def test_a_body_that_does_not_fit_is_refused_before_it_is_read(engine: Engine, app_client: AppClient) -> None:
     client = app_client(create_app(engine))
     with engine.memory.hold() as others:
         others.grow(6 * MIB)
@@ -141,7 +141,7 @@ def test_pictures_are_weighed_by_their_pixels_before_they_are_decoded(
 
 
 def test_a_sequence_is_weighed_as_a_whole(engine: Engine, app_client: AppClient, parts_of: Parts) -> None:
-    """Each of its frames would fit alone; all of them stay in memory until the answer."""
+    """Each frame fits the budget alone. All frames stay in memory until the answer."""
     client = app_client(create_app(engine))
     camera = {"width": 400, "height": 300, "fx": 200, "fy": 200, "cx": 199.5, "cy": 149.5}
     rgb = cv2.imencode(".png", np.zeros((300, 400, 3), np.uint8))[1].tobytes()

@@ -1,4 +1,4 @@
-"""Which hosts and origins may ask: DNS rebinding and foreign web pages get nothing."""
+"""Allowed hosts and origins: DNS rebinding and foreign pages are refused."""
 
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -32,7 +32,7 @@ def client_with(bundle_path: Path, app_client: AppClient) -> Iterator[Callable[.
 
 
 def routes_of(app: FastAPI) -> set[tuple[str, str]]:
-    """Method and path of all routes, from the contract and beside it."""
+    """Return method and path of all routes, in the contract and beside it."""
     document = app.openapi()
     found = {(method.upper(), path) for path, methods in document["paths"].items() for method in methods}
     hidden = {("GET", "/console"), ("GET", "/console/"), ("GET", "/openapi.json"), ("POST", "/nowhere")}
@@ -59,7 +59,7 @@ def test_a_foreign_host_is_refused_on_every_route_but_those_of_orchestrators(
 
 
 def test_a_page_whose_name_was_made_to_point_here_changes_nothing(client_with: Any) -> None:
-    """DNS rebinding: to the browser page and service are of one origin, so it sends both names alike and asks no CORS."""
+    """With DNS rebinding, page and service have the same origin. The browser sends equal names and no CORS request."""
     client = client_with()
     (entry,) = client.get("/v1/maps").json()["maps"]
     page = {"Host": "evil.example:8000", "Origin": "http://evil.example:8000", "Sec-Fetch-Site": "same-origin"}
@@ -81,7 +81,7 @@ def test_addresses_and_loopback_names_are_always_ours(engine: Engine, app_client
     ["", "evil.example", "127.0.0.1.evil.example", "localhost.evil.example", "evil.example:127.0.0.1", "[::1].evil.example",
      "127.0.0.1@evil.example", "evil.example/127.0.0.1", "notlocalhost", "::1", "[evil.example]", "localhost:8000:8000"],
 )  # fmt: skip
-def test_what_only_looks_like_loopback_is_not_ours(engine: Engine, app_client: AppClient, host: str) -> None:
+def test_a_name_that_looks_like_loopback_is_refused(engine: Engine, app_client: AppClient, host: str) -> None:
     assert app_client(create_app(engine)).get("/v1/maps", headers={"Host": host}).status_code == 403
 
 
@@ -97,9 +97,14 @@ def test_there_must_be_one_host(engine: Engine, app_client: AppClient) -> None:
 def test_listed_names_are_ours_at_any_port(client_with: Any) -> None:
     client = client_with(allowed_hosts=("maps.example", "*.robots.example"))
     for host, status in (
-        ("maps.example", 200), ("Maps.Example:443", 200), ("a.b.robots.example", 200), ("127.0.0.1", 200), ("robots.example", 403),
-        ("evilrobots.example", 403), ("x.maps.example", 403),
-    ):  # fmt: skip
+        ("maps.example", 200),
+        ("Maps.Example:443", 200),
+        ("a.b.robots.example", 200),
+        ("127.0.0.1", 200),
+        ("robots.example", 403),
+        ("evilrobots.example", 403),
+        ("x.maps.example", 403),
+    ):
         assert client.get("/v1/maps", headers={"Host": host}).status_code == status, host
 
 
@@ -140,8 +145,9 @@ def test_without_keys_beyond_loopback_names_must_be_listed(client_with: Any) -> 
     ],
 )
 @pytest.mark.parametrize(
-    ("method", "path"), [("PUT", "/v1/maps/tiny/serving"), ("POST", "/v1/localize"), ("POST", "/geopose"), ("DELETE", "/v1/maps")]
-)  # fmt: skip
+    ("method", "path"),
+    [("PUT", "/v1/maps/tiny/serving"), ("POST", "/v1/localize"), ("POST", "/geopose"), ("DELETE", "/v1/maps")],
+)
 def test_only_pages_of_the_same_origin_or_a_listed_name_may_send_more_than_get(
     client_with: Any, origin: str, host: str, allowed: bool, method: str, path: str
 ) -> None:
@@ -152,7 +158,7 @@ def test_only_pages_of_the_same_origin_or_a_listed_name_may_send_more_than_get(
 
 
 def test_the_name_that_a_service_listens_on_is_no_listed_origin(client_with: Any) -> None:
-    """A page of another port of this machine is another program's."""
+    """A page on another port of this machine belongs to another program."""
     client = client_with(host="localhost")
     headers = {"Host": "localhost:8000", "Origin": "http://localhost:9999"}
     assert (

@@ -40,7 +40,7 @@ def test_a_service_with_a_map_lives_and_is_ready(client: httpx.Client) -> None:
 
 @pytest.fixture
 def empty(client_of: Callable[[Engine], httpx.Client]) -> Iterator[tuple[Engine, httpx.Client]]:
-    """A service without a map."""
+    """Return a service without a map."""
     engine = Engine(MapRegistry(), Settings(threads=1))
     yield engine, client_of(engine)
     engine.close()
@@ -54,9 +54,12 @@ def test_a_service_without_a_map_lives_and_is_not_ready(
     assert client.get("/v1/maps").json() == {"maps": []}
     parts = {name: (name, data) for name, data in parts_of().items()}
     for response in (
-        client.get("/readyz"), client.post("/v1/localize", files=parts), client.get("/v1/maps/tiny/streets"),
-        client.get("/v1/maps/tiny/places"), client.get("/v1/maps/tiny/cloud"),
-    ):  # fmt: skip
+        client.get("/readyz"),
+        client.post("/v1/localize", files=parts),
+        client.get("/v1/maps/tiny/streets"),
+        client.get("/v1/maps/tiny/places"),
+        client.get("/v1/maps/tiny/cloud"),
+    ):
         assert (response.status_code, response.json()["code"]) == (503, "not-ready")
         assert "no map is mounted" in response.json()["detail"]
         assert response.headers["retry-after"]
@@ -90,7 +93,7 @@ def test_no_page_mentions_another_host(client: httpx.Client) -> None:
     ("method", "path", "status", "code"),
     [("GET", "/nowhere", 404, "not-found"), ("GET", "/v1/localize", 405, "method-not-allowed")],
 )
-def test_what_http_refuses_is_a_problem_too(
+def test_refusals_of_http_itself_are_problems_too(
     client: httpx.Client, method: str, path: str, status: int, code: str
 ) -> None:
     response = client.request(method, path)

@@ -1,4 +1,4 @@
-"""What httptools does not bound, over real sockets: uvicorn with the protocol in front of an application that reads the body."""
+"""Limits that httptools lacks, over real sockets: uvicorn with our protocol and an application that reads the body."""
 
 import asyncio
 import socket
@@ -49,7 +49,7 @@ def connect(monkeypatch: pytest.MonkeyPatch) -> Iterator[Connect]:
 
 
 def told(connection: socket.socket) -> bytes:
-    """All that comes until the service closes."""
+    """Return all bytes until the service closes the connection."""
     found = b""
     try:
         while piece := connection.recv(65536):
@@ -60,7 +60,7 @@ def told(connection: socket.socket) -> bytes:
 
 
 def answers(connection: socket.socket, count: int) -> list[bytes]:
-    """Status and body of each of the next answers."""
+    """Return status and body of each of the next answers."""
     found = b""
     while len(each := found.split(b"HTTP/1.1 ")[1:]) < count or len(each[-1].partition(b"\r\n\r\n")[2]) < 8:
         piece = connection.recv(65536)
@@ -70,7 +70,7 @@ def answers(connection: socket.socket, count: int) -> list[bytes]:
 
 
 def first(connection: socket.socket) -> bytes:
-    """Of the next one."""
+    """Return the next answer."""
     return answers(connection, 1)[0]
 
 
@@ -97,9 +97,7 @@ def test_a_chunked_body_of_many_small_chunks_is_a_body(connect: Connect) -> None
     assert first(connection) == b"200 192000"
 
 
-@pytest.mark.parametrize(
-    "piece", [b"X-A: a\r\n", b"a" * 1000, b"\r\n"], ids=["headers", "one header", "empty lines"]
-)  # fmt: skip
+@pytest.mark.parametrize("piece", [b"X-A: a\r\n", b"a" * 1000, b"\r\n"], ids=["headers", "one header", "empty lines"])
 def test_a_head_without_end_is_refused(connect: Connect, piece: bytes) -> None:
     connection = connect()
     connection.sendall(b"" if piece == b"\r\n" else b"GET / HTTP/1.1\r\nHost: x\r\nX-B: ")
@@ -121,9 +119,7 @@ def test_a_head_just_within_the_limit_is_read(connect: Connect) -> None:
     assert first(connection) == b"200 0"
 
 
-@pytest.mark.parametrize(
-    "piece", [b"0" * 100, b"X-T: " + b"a" * 95], ids=["chunk size", "trailer"]
-)  # fmt: skip
+@pytest.mark.parametrize("piece", [b"0" * 100, b"X-T: " + b"a" * 95], ids=["chunk size", "trailer"])
 def test_frames_of_a_chunked_body_without_end_close_it(connect: Connect, piece: bytes) -> None:
     connection = connect()
     start = b"" if piece.startswith(b"0") else b"0\r\n"

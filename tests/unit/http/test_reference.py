@@ -1,4 +1,4 @@
-"""``/docs``: the contract as a page that needs nothing from another host."""
+"""``/docs``: the contract as a page that loads nothing from other hosts."""
 
 import re
 from collections.abc import Callable
@@ -20,7 +20,13 @@ DOCUMENT = {
                 "operationId": "ask",
                 "summary": "Ask",
                 "parameters": [
-                    {"name": "map", "in": "query", "required": True, "schema": {"type": "string", "maxLength": 64}, "description": "of <b>"}
+                    {
+                        "name": "map",
+                        "in": "query",
+                        "required": True,
+                        "schema": {"type": "string", "maxLength": 64},
+                        "description": "of <b>",
+                    }
                 ],
                 "requestBody": {"content": {"application/json": {"schema": {"$ref": "#/components/schemas/Question"}}}},
                 "responses": {
@@ -45,7 +51,7 @@ DOCUMENT = {
             }
         }
     },
-}  # fmt: skip
+}
 
 
 @pytest.fixture(scope="module")

@@ -1,4 +1,4 @@
-"""What ``evaluate`` measures is what the service answers: the same frames, by both, over HTTP."""
+"""``evaluate`` measures what the service answers: the same frames give the same results over HTTP."""
 
 import json
 import shutil
@@ -23,7 +23,7 @@ NAME = "drive1_precise"
 
 @pytest.fixture(scope="module")
 def rig_dataset(small_dataset, tmp_path_factory):
-    """The small dataset as a stereo rig leaves it: JPEGs of four times the size, and a baseline beside the depth."""
+    """Return the small dataset like that of a stereo rig: JPEGs of four times the size, and a baseline."""
     folder = shutil.copytree(small_dataset.folder, tmp_path_factory.mktemp("datasets") / "rig")
     for path in (folder / "queries" / NAME / "rgb").iterdir():
         small = cv2.imread(str(path))
@@ -87,7 +87,7 @@ def _same_pose(pose, T, covariance):
 
 
 def test_the_baseline_and_the_reduced_colour_reach_the_query(rig_dataset, calibrated_map):
-    """Both were left out by what measured, and used by what served."""
+    """Earlier, ``evaluate`` ignored both, but the service used them."""
     frame = next(iter(rig_dataset.queries(NAME)))
     query = frame.query(MapBundle.open(calibrated_map).grid)
     assert query.baseline_m == 0.5

@@ -1,4 +1,4 @@
-"""Which version of a map serves, and who may say so."""
+"""The version of a map that serves, and who may choose it."""
 
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -83,12 +83,15 @@ def test_without_keys_only_this_machines_users_may(engine_of: Any, app_client: A
 @pytest.mark.parametrize(
     ("path", "body", "status", "field"),
     [
-        ("tiny", {"version": "x"}, 404, "version"), ("west", {"version": "x"}, 404, "map"), ("tiny", {}, 422, "version"),
-        ("tiny", {"version": "x" * 65}, 422, "version"), ("tiny", {"version": "x", "more": 1}, 422, "more"),
+        ("tiny", {"version": "x"}, 404, "version"),
+        ("west", {"version": "x"}, 404, "map"),
+        ("tiny", {}, 422, "version"),
+        ("tiny", {"version": "x" * 65}, 422, "version"),
+        ("tiny", {"version": "x", "more": 1}, 422, "more"),
         ("tiny", {"version": "x" * 5000}, 413, None),
     ],
-)  # fmt: skip
-def test_what_cannot_serve_is_told(
+)
+def test_a_bundle_that_cannot_serve_is_reported(
     engine_of: Any, app_client: Any, path: str, body: Any, status: int, field: str
 ) -> None:
     refused = app_client(create_app(engine_of())).put(f"/v1/maps/{path}/serving", json=body)

@@ -39,15 +39,15 @@ def test_it_stays_within_its_limit(values):
     assert np.abs(found).max() <= LIMIT
 
 
-def test_what_is_not_seen_is_zero():
+def test_cells_outside_the_view_are_zero():
     seen = np.array([[True, True, False, False]])
     assert (of([1.0, 4.0, 9.0, 16.0], seen=seen)[0, 2:] == 0).all()
 
 
 @pytest.mark.parametrize("values", [[0, 0, 0, 0], [7, 7, 7, 7], [100, 101, 100, 101]])
-def test_a_view_without_contrast_tells_nothing(values):
+def test_a_view_without_contrast_carries_no_information(values):
     assert not of(values).any()
 
 
-def test_a_view_without_a_measured_cell_tells_nothing():
+def test_a_view_without_a_measured_cell_carries_no_information():
     assert not of([1.0, 2.0, 3.0, 4.0], measured=~ALL).any()

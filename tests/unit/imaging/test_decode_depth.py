@@ -109,7 +109,7 @@ def test_8_bit_png_is_refused_and_carla_is_named(picture):
 
 
 @pytest.mark.parametrize("data", [encoded(".png", millimetres()), npy(metres())])
-def test_what_is_not_a_colour_png_is_refused_as_carla(data):
+def test_a_file_that_is_no_colour_png_is_refused_as_carla_depth(data):
     with pytest.raises(UnsupportedFormatError, match="carla"):
         decode_depth(data, camera=CAMERA, encoding="carla")
 
@@ -328,7 +328,7 @@ def test_a_damaged_raw16_is_refused(data):
 
 
 @pytest.mark.parametrize("codec", ["zstd", "lz4"])
-def test_what_is_written_is_read(codec):
+def test_written_values_are_read(codec):
     values = np.random.default_rng(1).integers(0, 2**16, (37, 53), np.uint16)
     camera = PinholeCamera(53, 37, 30.0, 30.0, 26.0, 18.0)
     np.testing.assert_array_equal(decode_depth(write_raw16(values, codec), camera=camera, scale_m=1.0), values)
@@ -362,7 +362,12 @@ def test_damaged_bytes_give_a_depth_or_an_error_of_ours(data, changes):
 
 @pytest.mark.parametrize(
     ("stored", "encoding", "scale_m"),
-    [("uint16", None, 0.001), ("uint32", "carla", 1000 / (2**24 - 1)), ("float32", "auto", 1.0), ("float32", "compressed_depth", 1.0)],
-)  # fmt: skip
+    [
+        ("uint16", None, 0.001),
+        ("uint32", "carla", 1000 / (2**24 - 1)),
+        ("float32", "auto", 1.0),
+        ("float32", "compressed_depth", 1.0),
+    ],
+)
 def test_the_scale_without_a_request_for_one_follows_from_the_stored_numbers(stored, encoding, scale_m):
     assert default_scale_m(np.dtype(stored), encoding) == scale_m

@@ -195,10 +195,11 @@ def test_rgb_of_other_size_is_refused_with_both_sizes():
 
 
 @pytest.mark.parametrize(
-    ("width", "finest_px", "by"), [(640, 0.0, 1), (640, 1.9, 1), (640, 2.0, 2), (641, 3.9, 2), (640, 4.0, 4), (637, 8.0, 8), (640, 99.0, 8)]
-)  # fmt: skip
+    ("width", "finest_px", "by"),
+    [(640, 0.0, 1), (640, 1.9, 1), (640, 2.0, 2), (641, 3.9, 2), (640, 4.0, 4), (637, 8.0, 8), (640, 99.0, 8)],
+)
 def test_a_jpeg_is_decoded_no_finer_than_is_wanted(width, finest_px, by):
-    """``finest_px``: how many of its pixels are as wide as what is wanted."""
+    """``finest_px``: number of image pixels per required pixel."""
     v, u = np.mgrid[:120, :width]
     picture = np.stack([u * 255 // width, v * 2, 0 * u], axis=-1).astype(np.uint8)
     data = cv2.imencode(".jpg", picture[..., ::-1], (cv2.IMWRITE_JPEG_QUALITY, 100))[1].tobytes()

@@ -1,4 +1,4 @@
-"""The compiled gather against the same said in NumPy."""
+"""The compiled gather against the same computation in NumPy."""
 
 import numpy as np
 import pytest
@@ -17,7 +17,7 @@ GRID = ViewGrid(rows=5, columns=37)  # neither a whole block of cells nor a whol
 
 
 def plain(rgb, depth_m, camera, R, grid):
-    """Ray by ray; float32 throughout, as the kernel."""
+    """Compute ray by ray in float32, as the kernel does."""
     rays = _sub_rays(grid).transpose(2, 0, 1).astype(np.float64) @ R.T
     cells = len(rays)
     ranges, colour, seen = np.zeros(cells), np.zeros((cells, 3)), np.zeros(cells, bool)
@@ -48,10 +48,13 @@ def plain(rgb, depth_m, camera, R, grid):
 
 @settings(max_examples=30, deadline=None)
 @given(
-    seed=st.integers(0, 2**32 - 1), turn=st.floats(-3.2, 3.2), tilt=st.floats(-0.4, 0.4), own_size=st.booleans(),
+    seed=st.integers(0, 2**32 - 1),
+    turn=st.floats(-3.2, 3.2),
+    tilt=st.floats(-0.4, 0.4),
+    own_size=st.booleans(),
     holes=st.floats(0, 1),
-)  # fmt: skip
-def test_the_kernel_says_what_plain_numpy_says(seed, turn, tilt, own_size, holes):
+)
+def test_the_kernel_equals_numpy(seed, turn, tilt, own_size, holes):
     rng = np.random.default_rng(seed)
     camera = PinholeCamera(64, 48, 31.7, 31.9, 31.3, 23.1)
     rgb = rng.integers(0, 256, (48, 64, 3), np.uint8)
@@ -66,7 +69,7 @@ def test_the_kernel_says_what_plain_numpy_says(seed, turn, tilt, own_size, holes
     assert found[2].dtype == np.bool_
 
 
-def test_what_is_not_finite_is_no_measurement():
+def test_a_value_that_is_not_finite_is_no_measurement():
     camera = PinholeCamera(64, 48, 32.0, 32.0, 31.5, 23.5)
     rgb = np.full((48, 64, 3), 255, np.uint8)
     for value in (np.nan, np.inf, -np.inf, -3.0, 0.0, 1e30):

@@ -14,12 +14,12 @@ DOWN_AHEAD = np.array([0.0, 1.0, 0.0])
 
 
 def tilted(*, pitch_deg=0.0, roll_deg=0.0):
-    """R_level_camera of a camera that looks along x, pitched down and rolled."""
+    """Return R_level_camera of a camera that looks along x, pitched down and rolled."""
     return rotation_y(np.deg2rad(pitch_deg)) @ rotation_x(np.deg2rad(roll_deg)) @ R_BODY_OPTICAL
 
 
 def ground_depth(R_level_camera, height_m, *, camera=CAMERA, reach_m=60.0):
-    """z of an endless plane ``height_m`` below the camera; 0 above the horizon."""
+    """Return z of an infinite plane ``height_m`` below the camera; 0 above the horizon."""
     down = -(camera.rays_of_pixels() @ R_level_camera.T)[..., 2]
     z = np.where(down > 1e-6, height_m / np.maximum(down, 1e-6), 0.0)
     return np.where(z < reach_m, z, 0.0).astype(np.float32)
@@ -84,7 +84,7 @@ def test_the_foot_of_a_wall_seven_metres_ahead_tilts_the_ground_by_a_degree_and_
 
 
 def street_depth(kerb_m):
-    """Depth of a road 10 m wide between pavements that stand a kerb higher, seen from 1.5 m above its middle."""
+    """Return the depth of a road 10 m wide between raised pavements, seen from 1.5 m above its centre."""
     rays = CAMERA.rays_of_pixels()
     down, aside = np.maximum(rays[..., 1], 1e-9), np.abs(rays[..., 0])
     road, pavement = 1.5 / down, (1.5 - kerb_m) / down
@@ -120,10 +120,15 @@ def test_the_nominal_level_is_a_rotation_whose_third_row_is_up():
 
 @settings(max_examples=40, deadline=None)
 @given(
-    seed=st.integers(0, 2**32 - 1), pitch_deg=st.floats(-8, 8), roll_deg=st.floats(-8, 8), noise=st.floats(0, 0.3),
-    size=st.sampled_from([(120, 160), (61, 79), (30, 500), (1, 1)]), holes=st.floats(0, 1), std_m=st.floats(0.01, 1),
-)  # fmt: skip
-def test_the_compiled_fit_says_what_plain_numpy_says(seed, pitch_deg, roll_deg, noise, size, holes, std_m):
+    seed=st.integers(0, 2**32 - 1),
+    pitch_deg=st.floats(-8, 8),
+    roll_deg=st.floats(-8, 8),
+    noise=st.floats(0, 0.3),
+    size=st.sampled_from([(120, 160), (61, 79), (30, 500), (1, 1)]),
+    holes=st.floats(0, 1),
+    std_m=st.floats(0.01, 1),
+)
+def test_the_compiled_fit_equals_numpy(seed, pitch_deg, roll_deg, noise, size, holes, std_m):
     rng = np.random.default_rng(seed)
     camera = PinholeCamera(size[1], size[0], 80.0, 80.0, size[1] / 2, size[0] / 2)
     depth_m = ground_depth(tilted(pitch_deg=pitch_deg, roll_deg=roll_deg), 1.6, camera=camera)
@@ -181,7 +186,7 @@ def test_half_and_twice_the_usual_height_are_suspicious_unless_given(height_m, o
 
 
 def test_a_plane_with_points_below_it_is_no_ground():
-    """The roof of a car fills the near half of the image; the ground beside it lies 1.4 m lower."""
+    """The roof of a car fills the near half of the image. The ground beside it is 1.4 m lower."""
     roof, ground = ground_depth(tilted(), 0.6), ground_depth(tilted(), 2.0)
     depth_m = np.where(np.arange(160) < 60, roof, ground).astype(np.float32)
     level, origin = level_query(depth_m, CAMERA)

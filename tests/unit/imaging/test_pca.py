@@ -15,7 +15,7 @@ def cloud(seed, dimensions=3, count=200):
 
 
 def street_canyon(*, heading_deg=0.0, height_m=1.8, slope=0.0, seed=0):
-    """A road 8 m wide between two walls that run along the heading, seen from its middle; the ground tilts by ``slope``."""
+    """Return a road 8 m wide between two walls along the heading, seen from its centre. The ground has the slope ``slope``."""
     rng = np.random.default_rng(seed)
     x, y = rng.uniform(-40, 40, 9000), rng.uniform(-4, 4, 9000)
     road = np.stack([x, y, np.zeros(9000)], axis=1)

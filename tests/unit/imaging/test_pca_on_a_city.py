@@ -1,4 +1,4 @@
-"""Levelling and the principal heading against the truth of a simulated city with slopes."""
+"""Levelling and principal heading against the ground truth of a simulated city with slopes."""
 
 import itertools
 from dataclasses import dataclass
@@ -27,7 +27,7 @@ class Measured:
 
 
 def crossings(city):
-    """Where centre lines meet, or end beside another."""
+    """Return the points where centre lines intersect, or end beside another."""
     lines = [shapely.LineString(line) for street in city.streets for line in street.lines]
     points = []
     for k, line in enumerate(lines):
@@ -51,14 +51,15 @@ def measured_at(city, scene, station, rng):
     heading = principal_heading(points @ level.R_level_sensor.T.astype(np.float32), height_m=level.height_m)
     R_map_level = T_map_lidar[:3, :3] @ level.R_level_sensor.T
     return Measured(
-        float(np.rad2deg(np.arccos(min(1.0, up[2])))), level.height_m - height,
+        float(np.rad2deg(np.arccos(min(1.0, up[2])))),
+        level.height_m - height,
         heading + heading_of_body(transform_from(R_map_level, np.zeros(3))),
-    )  # fmt: skip
+    )
 
 
 @pytest.fixture(scope="module")
 def neighbours():
-    """Pairs of scans 1 m apart, spread over the streets of a city, none near a crossing."""
+    """Return pairs of scans 1 m apart, spread over the streets of a city, away from crossings."""
     city = City(seed=5, size_m=(160.0, 160.0))
     scene, rng = Scene(joined([city.static, city.occupants(0)])), np.random.default_rng(1)
     track, corners = stations(city, 1.0), crossings(city)

@@ -1,4 +1,4 @@
-"""The quick reader against OpenCV's, and what a damaged file is told."""
+"""The fast PNG reader against that of OpenCV, and its errors for damaged files."""
 
 import itertools
 import resource
@@ -25,7 +25,7 @@ def chunk(kind: bytes, data: bytes) -> bytes:
 
 
 def png(pixels: np.ndarray, filters, *, pieces: int = 1, extra: bytes = b"", bits: int = 16) -> bytes:
-    """A PNG whose rows are filtered as told, by the definitions of RFC 2083."""
+    """Encode a PNG with given row filters, by the definitions of RFC 2083."""
     height, width = pixels.shape
     rows = pixels.astype(">u2").view(np.uint8).reshape(height, 2 * width).astype(int)
     raw = bytearray()
@@ -49,9 +49,13 @@ def png(pixels: np.ndarray, filters, *, pieces: int = 1, extra: bytes = b"", bit
 
 @settings(max_examples=60, deadline=None)
 @given(
-    seed=st.integers(0, 2**32 - 1), height=st.integers(1, 9), width=st.integers(1, 9),
-    filters=st.lists(st.integers(0, 4), min_size=1, max_size=9), pieces=st.integers(1, 4), smooth=st.booleans(),
-)  # fmt: skip
+    seed=st.integers(0, 2**32 - 1),
+    height=st.integers(1, 9),
+    width=st.integers(1, 9),
+    filters=st.lists(st.integers(0, 4), min_size=1, max_size=9),
+    pieces=st.integers(1, 4),
+    smooth=st.booleans(),
+)
 def test_pixels_are_those_that_were_written_and_that_opencv_reads(seed, height, width, filters, pieces, smooth):
     rng = np.random.default_rng(seed)
     pixels = rng.integers(0, 300 if smooth else 65536, (height, width)).astype(np.uint16)
@@ -68,7 +72,7 @@ def test_a_depth_cameras_picture_is_read_as_opencv_reads_it():
         np.testing.assert_array_equal(read_depth_values(data, encoding=None, limits=DEFAULT_LIMITS), depth)
 
 
-def test_what_is_not_plain_goes_to_opencv():
+def test_an_unusual_png_goes_to_opencv():
     colour = cv2.imencode(".png", np.zeros((3, 4, 3), np.uint16))[1].tobytes()
     grey8 = cv2.imencode(".png", np.zeros((3, 4), np.uint8))[1].tobytes()
     interlaced = bytearray(png(np.zeros((3, 4), np.uint16), [0]))
@@ -93,14 +97,14 @@ PIXELS = np.arange(12, dtype=np.uint16).reshape(3, 4)
         (HEAD + chunk(b"IEND", b""), "damaged"),
         (HEAD + chunk(b"IDAT", zlib.compress(bytes(27))[:-1] + b"?") + chunk(b"IEND", b""), "damaged"),
     ],
-)  # fmt: skip
+)
 def test_a_damaged_file_says_what_is_wrong(data, says):
     with pytest.raises(DecodeError, match=says):
         read_grey16(data, 3, 4, field="depth")
 
 
 def test_a_bomb_is_inflated_no_further_than_the_picture_needs():
-    """A gigabyte of zeros behind a header of 3 x 4 pixels."""
+    """A header of 3 x 4 pixels precedes a gigabyte of compressed zeros."""
     packed = zlib.compressobj()
     body = b"".join(packed.compress(bytes(2**20)) for _ in range(1024)) + packed.flush()
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss

@@ -15,7 +15,7 @@ WALL_M, HEIGHT_M = 10.0, 1.5
 
 
 def wall_depth(camera=CAMERA, *, wall_m=WALL_M):
-    """Flat ground and an upright wall square to the optical axis."""
+    """Return the depth of flat ground and a vertical wall perpendicular to the optical axis."""
     down = (np.arange(camera.height) - camera.cy) / camera.fy
     z = np.minimum(wall_m, HEIGHT_M / np.maximum(down, 1e-6))
     return np.repeat(z[:, None], camera.width, axis=1).astype(np.float32)

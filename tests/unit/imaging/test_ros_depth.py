@@ -1,4 +1,4 @@
-"""compressedDepth against an encoder by the publication, and what damaged data are told."""
+"""compressedDepth against an encoder from the publication, and the errors for damaged data."""
 
 import contextlib
 import struct
@@ -19,7 +19,7 @@ LIMITS = ImageLimits(max_pixels=10_000)
 
 
 def rvl(values: np.ndarray) -> bytes:
-    """Wilson, ISS 2017: runs of zeros, runs of zigzag differences, groups of three bits in nibbles."""
+    """Encode by Wilson, ISS 2017: runs of zeros, runs of zigzag differences, groups of three bits in nibbles."""
     nibbles: list[int] = []
 
     def write(number: int) -> None:
@@ -66,7 +66,7 @@ def test_png_is_read_and_millimetres_become_metres():
 
 
 def test_inverse_depth_becomes_metres():
-    """A = 100, B = 0.5: a value of 20 is 100 / 19.5 m; 0 is no measurement."""
+    """A = 100 and B = 0.5: the value 20 is 100 / 19.5 m. 0 means no measurement."""
     values = np.array([[0, 20, 60]], np.uint16)
     depth_m = decode_depth(
         message(rvl(values), a=100.0, b=0.5),

@@ -82,12 +82,12 @@ def test_the_panorama_closes_over_its_seam():
 
 
 @pytest.mark.parametrize("range_m", [0.3, 40.5, 90.0])
-def test_what_lies_outside_the_limits_is_no_measurement(range_m):
+def test_values_outside_the_limits_are_no_measurement(range_m):
     assert not view_of(points_at(0.0, 0.0, range_m)).any()
 
 
 @pytest.mark.parametrize("elevation_deg", [18.0, -18.0])
-def test_what_lies_above_or_below_the_rows_is_left_out(elevation_deg):
+def test_points_above_or_below_the_rows_are_left_out(elevation_deg):
     assert not view_of(points_at(elevation_deg, 0.0, 10.0)).any()
 
 
@@ -167,7 +167,7 @@ def test_planes_of_a_survey_view_have_no_colour_and_are_blank_in_rows_that_it_do
     assert (planes["range_m"][3:] == 10).all()
 
 
-def test_survey_planes_forget_what_lies_beyond_the_limit():
+def test_survey_planes_discard_ranges_beyond_the_limit():
     planes = survey_planes(lidar_view(41.0), sensor_height_m=1.8, rows_seen=np.ones(9, np.bool_), grid=GRID)
     assert not planes[[0, 3, 5]].any()
 

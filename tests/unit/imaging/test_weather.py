@@ -16,7 +16,7 @@ def beams(channels, columns):
 
 
 def street_with_flakes(*, channels=32, columns=1024, flakes=0.06, seed=3):
-    """Ground, a wall on the left, a pole; a share of the beams returns from a flake between 1 and 15 m instead."""
+    """Return ground, a wall on the left and a pole. A share of the beams returns from flakes between 1 and 15 m."""
     rng = np.random.default_rng(seed)
     rays = beams(channels, columns)
     with np.errstate(divide="ignore"):

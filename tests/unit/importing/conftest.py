@@ -1,4 +1,4 @@
-"""KITTI's object layout in little, recordings made of lists, and ROS bags written message by message."""
+"""Small files in KITTI's object layout, recordings from lists, and ROS bags written message by message."""
 
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
@@ -41,7 +41,7 @@ def calibration_text(focal_px: float = 200.0) -> str:
 def write_frame(
     training: Path, name: str, *, right: bool = True, scan: bool = True, stored: bool = True, focal_px: float = 200.0
 ) -> None:
-    """A wall of random dots 5 m before the camera, as a stereo pair, a scan of few points and a stored depth."""
+    """Write a wall of random dots 5 m ahead: a stereo pair, a sparse scan and a stored depth."""
     rng = np.random.default_rng(int(name))
     for kind in ("image_2", "image_3", "velodyne", "gt_depth", "calib"):
         (training / kind).mkdir(parents=True, exist_ok=True)
@@ -60,7 +60,7 @@ def write_frame(
 
 @pytest.fixture
 def kitti(tmp_path: Path) -> Path:
-    """Two frames with all, one without a scan (and depth), one without a right picture."""
+    """Return two complete frames, one without a scan (and depth), one without a right image."""
     training = tmp_path / "source" / "training"
     write_frame(training, "000003")
     write_frame(training, "000004", focal_px=190.0)
@@ -84,7 +84,7 @@ def kitti_recording() -> Path:
 
 @dataclass
 class ListedRecording:
-    """A recording whose events are given."""
+    """A recording with given events."""
 
     given: Iterable[Event | BaseException]
     poses: Trajectory | None = None
@@ -113,7 +113,7 @@ def recording_of() -> Callable[..., ListedRecording]:
 
 
 def make_trajectory(seconds: float = 10.0, *, speed: float = 1.0, rate_hz: float = 10.0) -> Trajectory:
-    """Straight along x."""
+    """Return a straight trajectory along x."""
     stamps = np.arange(0, seconds + 1e-9, 1 / rate_hz)
     T = np.tile(np.eye(4), (len(stamps), 1, 1))
     T[:, 0, 3] = speed * stamps
@@ -139,9 +139,13 @@ def make_picture(stamp_s: float, **changed: Any) -> RecordedPicture:
     camera = PinholeCamera(8, 6, 8.0, 8.0, 3.5, 2.5)
     rgb = np.random.default_rng(round(stamp_s * 1000)).integers(0, 256, (6, 8, 3), dtype=np.uint8)
     given: dict[str, Any] = {
-        "name": f"picture at {stamp_s:g}", "stamp_s": stamp_s, "rgb": rgb, "camera": camera,
-        "T_vehicle_camera": transform_from(R_BODY_OPTICAL, np.zeros(3)), "depth": np.full((6, 8), 2.5, np.float32),
-    }  # fmt: skip
+        "name": f"picture at {stamp_s:g}",
+        "stamp_s": stamp_s,
+        "rgb": rgb,
+        "camera": camera,
+        "T_vehicle_camera": transform_from(R_BODY_OPTICAL, np.zeros(3)),
+        "depth": np.full((6, 8), 2.5, np.float32),
+    }
     return RecordedPicture(**(given | changed))
 
 
@@ -169,20 +173,34 @@ class Ros:
     def cloud(self, stamp_s: float, points: Any = ((1, 2, 3, 4),), *, frame: str = "lidar", names: str = "xyzi") -> Any:
         data = np.array(points, "<f4").reshape(-1, len(names))
         fields = [
-            self.make("sensor_msgs/PointField", name=name, offset=4 * k, datatype=7, count=1) for k, name in enumerate(names)
-        ]  # fmt: skip
+            self.make("sensor_msgs/PointField", name=name, offset=4 * k, datatype=7, count=1)
+            for k, name in enumerate(names)
+        ]
         return self.make(
-            "sensor_msgs/PointCloud2", header=self.header(stamp_s, frame), height=1, width=len(data), fields=fields,
-            is_bigendian=False, point_step=4 * len(names), row_step=4 * len(names) * len(data),
-            data=data.view(np.uint8).reshape(-1), is_dense=True,
-        )  # fmt: skip
+            "sensor_msgs/PointCloud2",
+            header=self.header(stamp_s, frame),
+            height=1,
+            width=len(data),
+            fields=fields,
+            is_bigendian=False,
+            point_step=4 * len(names),
+            row_step=4 * len(names) * len(data),
+            data=data.view(np.uint8).reshape(-1),
+            is_dense=True,
+        )
 
     def image(self, stamp_s: float, pixels: Any, encoding: str, *, frame: str = "camera") -> Any:
         pixels = np.ascontiguousarray(pixels)
         return self.make(
-            "sensor_msgs/Image", header=self.header(stamp_s, frame), height=pixels.shape[0], width=pixels.shape[1],
-            encoding=encoding, is_bigendian=0, step=pixels.strides[0], data=pixels.view(np.uint8).reshape(-1),
-        )  # fmt: skip
+            "sensor_msgs/Image",
+            header=self.header(stamp_s, frame),
+            height=pixels.shape[0],
+            width=pixels.shape[1],
+            encoding=encoding,
+            is_bigendian=0,
+            step=pixels.strides[0],
+            data=pixels.view(np.uint8).reshape(-1),
+        )
 
     def info(
         self, stamp_s: float, *, focal: float = 8.0, size: tuple[int, int] = (6, 8), frame: str = "camera", D: Any = ()
@@ -190,10 +208,19 @@ class Ros:
         K = np.array([focal, 0, 3.5, 0, focal, 2.5, 0, 0, 1.0])
         roi = self.make("sensor_msgs/RegionOfInterest", x_offset=0, y_offset=0, height=0, width=0, do_rectify=False)
         return self.make(
-            "sensor_msgs/CameraInfo", header=self.header(stamp_s, frame), height=size[0], width=size[1],
-            distortion_model="plumb_bob", d=np.array(D, np.float64), k=K, r=np.eye(3).reshape(-1),
-            p=np.c_[K.reshape(3, 3), np.zeros(3)].reshape(-1), binning_x=0, binning_y=0, roi=roi,
-        )  # fmt: skip
+            "sensor_msgs/CameraInfo",
+            header=self.header(stamp_s, frame),
+            height=size[0],
+            width=size[1],
+            distortion_model="plumb_bob",
+            d=np.array(D, np.float64),
+            k=K,
+            r=np.eye(3).reshape(-1),
+            p=np.c_[K.reshape(3, 3), np.zeros(3)].reshape(-1),
+            binning_x=0,
+            binning_y=0,
+            roi=roi,
+        )
 
     def pose(self, T: Any) -> Any:
         x, y, z, w = (float(v) for v in quaternion_xyzw_from(T[:3, :3]))
@@ -207,9 +234,13 @@ class Ros:
         zero = self.make("geometry_msgs/Vector3", x=0.0, y=0.0, z=0.0)
         pose = self.make("geometry_msgs/PoseWithCovariance", pose=self.pose(T), covariance=np.zeros(36))
         twist = self.make(
-            "geometry_msgs/TwistWithCovariance", twist=self.make("geometry_msgs/Twist", linear=zero, angular=zero), covariance=np.zeros(36)
-        )  # fmt: skip
-        return self.make("nav_msgs/Odometry", header=self.header(stamp_s, "map"), child_frame_id=child, pose=pose, twist=twist)  # fmt: skip
+            "geometry_msgs/TwistWithCovariance",
+            twist=self.make("geometry_msgs/Twist", linear=zero, angular=zero),
+            covariance=np.zeros(36),
+        )
+        return self.make(
+            "nav_msgs/Odometry", header=self.header(stamp_s, "map"), child_frame_id=child, pose=pose, twist=twist
+        )
 
     def pose_stamped(self, stamp_s: float, T: Any) -> Any:
         return self.make("geometry_msgs/PoseStamped", header=self.header(stamp_s, "map"), pose=self.pose(T))
@@ -219,14 +250,17 @@ class Ros:
         at = self.make("geometry_msgs/Vector3", x=pose.position.x, y=pose.position.y, z=pose.position.z)
         transform = self.make("geometry_msgs/Transform", translation=at, rotation=pose.orientation)
         return self.make(
-            "geometry_msgs/TransformStamped", header=self.header(stamp_s, parent), child_frame_id=child, transform=transform
-        )  # fmt: skip
+            "geometry_msgs/TransformStamped",
+            header=self.header(stamp_s, parent),
+            child_frame_id=child,
+            transform=transform,
+        )
 
     def tf(self, *edges: Any) -> Any:
         return self.make("tf2_msgs/TFMessage", transforms=list(edges))
 
     def write(self, folder: Path, messages: list[tuple[str, float, Any]], *, storage: str = "mcap") -> Path:
-        """A ROS 2 bag of (topic, seconds, message); bytes for a message are written as they are, as a point cloud."""
+        """Write a ROS 2 bag of (topic, seconds, message). Bytes are written unchanged, as a point cloud."""
         rosbag2 = pytest.importorskip("rosbags.rosbag2")
         plugin = rosbag2.StoragePlugin.MCAP if storage == "mcap" else rosbag2.StoragePlugin.SQLITE3
         with rosbag2.Writer(folder, version=9, storage_plugin=plugin) as writer:

@@ -1,4 +1,4 @@
-"""CARLA's convention against the client package's own classes, recordings on disk, and the recorder against a world made here."""
+"""CARLA's convention against the classes of the client package, recordings on disk, and the recorder with a fake world."""
 
 import csv
 import json
@@ -99,7 +99,7 @@ def recorded(tmp_path):
     return out
 
 
-def test_what_was_recorded_is_read_again_in_our_convention(recorded):
+def test_a_recording_is_read_in_our_convention(recorded):
     folder = open_carla(recorded)
     scans = [event for event in folder.events() if isinstance(event, RecordedScan)]
     pictures = [event for event in folder.events() if isinstance(event, RecordedPicture)]
@@ -136,8 +136,11 @@ def test_frames_whose_files_are_missing_or_cut_off_are_counted(recorded):
     (recorded / "rgb" / "00000102.png").unlink()
     bad = [event for event in open_carla(recorded).events() if isinstance(event, Unusable)]
     assert [(b.kind, b.name) for b in bad] == [
-        ("scan", "00000100.ply"), ("scan", "00000101.ply"), ("image", "00000101.png"), ("image", "00000102.png")
-    ]  # fmt: skip
+        ("scan", "00000100.ply"),
+        ("scan", "00000101.ply"),
+        ("image", "00000101.png"),
+        ("image", "00000102.png"),
+    ]
 
 
 @pytest.mark.parametrize(
@@ -157,7 +160,7 @@ def test_frames_whose_files_are_missing_or_cut_off_are_counted(recorded):
         ("poses.csv", "frame,timestamp,x,y,z,roll,pitch,yaw\n1,1,0,0,0,0,0,0\n2,1,0,0,0,0,0,0\n", "pose 2: its time"),
     ],
 )
-def test_what_a_recording_lacks_is_named(recorded, file, text, why):
+def test_missing_parts_of_a_recording_are_named(recorded, file, text, why):
     (recorded / file).unlink() if text is None else (recorded / file).write_text(text)
     with pytest.raises(DatasetError, match=why):
         open_carla(recorded)
@@ -207,7 +210,7 @@ class FakeBlueprint:
 
 
 class FakeWorld:
-    """Ticks, spawns, and remembers what was asked of it."""
+    """A world that ticks, spawns, and records the calls."""
 
     def __init__(self, *, places=2, fails_at=None, failure=None, silent=(), skips=0):
         self.frame, self.log, self.actors, self.silent, self.skips = 40, [], [], silent, skips
@@ -251,7 +254,7 @@ class FakeWorld:
 
 @pytest.fixture
 def serve(carla, monkeypatch):
-    """Puts a client before the recorder that answers with a world; ``loads`` is what happens on connecting."""
+    """Give the recorder a client of a fake world. ``loads`` is called on connection."""
 
     def made(world, *, connects=lambda: None):
         def get_world():
@@ -263,8 +266,11 @@ def serve(carla, monkeypatch):
             set_random_device_seed=lambda seed: world.log.append(f"seed {seed}"),
         )
         client = SimpleNamespace(
-            set_timeout=lambda _: None, get_world=get_world, load_world=lambda _: get_world(), get_trafficmanager=lambda: traffic
-        )  # fmt: skip
+            set_timeout=lambda _: None,
+            get_world=get_world,
+            load_world=lambda _: get_world(),
+            get_trafficmanager=lambda: traffic,
+        )
         monkeypatch.setattr(carla, "Client", lambda *_: client)
         return world
 
@@ -287,8 +293,9 @@ def assert_put_back(world):
     assert world.log[-2:] == ["traffic False", "synchronous False"]
     sensors = ("sensor.lidar.ray_cast", "sensor.camera.rgb", "sensor.camera.depth")
     assert {entry for entry in world.log if entry.startswith(("stop", "destroy"))} == {
-        "destroy vehicle", *(f"{what} {kind}" for what in ("stop", "destroy") for kind in sensors)
-    }  # fmt: skip
+        "destroy vehicle",
+        *(f"{what} {kind}" for what in ("stop", "destroy") for kind in sensors),
+    }
     for kind in sensors:
         assert world.log.index(f"stop {kind}") < world.log.index(f"destroy {kind}")
 
@@ -318,14 +325,14 @@ def test_ctrl_c_keeps_what_was_recorded_and_puts_all_back(serve, tmp_path):
     assert len(open_carla(tmp_path / "out").frames) == 2
 
 
-def test_a_server_that_stops_is_told_with_what_was_kept(serve, tmp_path):
+def test_a_server_that_stops_is_reported_with_the_kept_part(serve, tmp_path):
     world = serve(FakeWorld(fails_at=3, failure=RuntimeError("time-out of 20000ms")))
     with pytest.raises(DatasetError, match=r"host:2000 failed .*time-out.*; 2 frames are in"):
         run(tmp_path / "out", frames=9)
     assert_put_back(world)
 
 
-def test_a_sensor_that_says_nothing_is_told(serve, tmp_path):
+def test_a_silent_sensor_is_reported(serve, tmp_path):
     world = serve(FakeWorld(silent=(42,)))
     with pytest.raises(DatasetError, match=r"a sensor sent no data for 0\.01 s"):
         run(tmp_path / "out")
@@ -339,7 +346,7 @@ def test_a_skipped_frame_is_not_taken_for_the_one_before(serve, tmp_path):
     assert_put_back(world)
 
 
-def test_no_server_is_told_with_the_remedy_and_nothing_is_written(serve, tmp_path):
+def test_a_missing_server_is_reported_with_the_remedy_and_nothing_is_written(serve, tmp_path):
     def refuse():
         raise RuntimeError("time-out")
 

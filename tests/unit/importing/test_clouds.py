@@ -138,7 +138,7 @@ def test_a_folder_without_scans_is_refused(tmp_path):
 
 @each_format
 def test_a_scan_that_vanishes_during_an_import_is_an_error_that_names_it(tmp_path, suffix):
-    """It ended with a traceback; to leave it out, as a damaged one, would lose a part of the map while a disk fails."""
+    """Earlier it ended with a traceback. Skipping the scan would lose a part of the map while a disk fails."""
     for number in range(2):
         WRITERS[suffix](tmp_path / f"{number}{suffix}")
     events = open_clouds(tmp_path).events()

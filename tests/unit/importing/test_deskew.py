@@ -9,7 +9,7 @@ T_VEHICLE_LIDAR = transform_from(rotation_z(0.4), np.array([0.5, -0.2, 1.8]))
 
 
 def pose_at(s):
-    """15 m/s along a bend of 0.6 rad/s, in closed form."""
+    """Return the pose at a time for 15 m/s and a bend of 0.6 rad/s, in closed form."""
     speed, turn = 15.0, 0.6
     at = np.array([np.sin(turn * s), 1 - np.cos(turn * s), 0.0]) * speed / turn
     return transform_from(rotation_z(turn * s), at)

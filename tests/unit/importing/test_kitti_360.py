@@ -1,4 +1,4 @@
-"""KITTI-360's layout: three trees side by side, poses of the moments at which the vehicle moved."""
+"""KITTI-360's layout: three folder trees, and poses at the times at which the vehicle moved."""
 
 import cv2
 import numpy as np
@@ -28,7 +28,7 @@ def pose(k):
 
 
 def scan_of(k):
-    """Points on circles, the ground among them, so that a map could be built."""
+    """Return points on circles, with ground points, so that a map can be built."""
     angle = np.linspace(0, 2 * np.pi, 40, endpoint=False)
     return np.c_[8 * np.cos(angle), 8 * np.sin(angle), np.full(40, 0.1 * k), np.full(40, 0.5)].astype(np.float32)
 

@@ -1,4 +1,4 @@
-"""KITTI's raw and odometry layouts: scans, pairs, calibration, times and poses, and what is said of what is broken."""
+"""KITTI's raw and odometry layouts: scans, pairs, calibration, times and poses, and errors for damaged files."""
 
 from typing import Any
 
@@ -30,7 +30,7 @@ def projection(x):
 
 
 def write_pictures(left, right, stored, name, seed):
-    """A wall 5 m ahead."""
+    """Write images of a wall 5 m ahead."""
     dots = cv2.GaussianBlur(np.random.default_rng(seed).integers(0, 256, (60, 240, 3), np.uint8), (3, 3), 0)
     for folder, picture in (
         (left, dots[:, :220]),
@@ -54,7 +54,7 @@ OXTS = [
 
 @pytest.fixture
 def raw(tmp_path):
-    """Three frames of a drive, each at a tenth of a second after the hour."""
+    """Write three frames of a drive, at 0.1, 0.2 and 0.3 s after the hour."""
     day = tmp_path / "2011_09_26"
     drive = day / "2011_09_26_drive_0005_sync"
     (drive / "velodyne_points" / "data").mkdir(parents=True)
@@ -124,7 +124,7 @@ def test_scans_and_pictures_come_with_the_mounting_of_the_calibration(drive):
 
 
 def only_grey(drive):
-    """The same pictures of one channel, by cameras 0 and 1, of which camera 0 has no offset."""
+    """Write the same images with one channel, from cameras 0 and 1. Camera 0 has no offset."""
     raw = "sync" in drive.name
     for colour, grey in (("2", "0"), ("3", "1")):
         folder = drive / (f"image_0{colour}" if raw else f"image_{colour}")
@@ -165,7 +165,7 @@ def test_only_matched_depth_has_a_baseline(drive, depth, baseline_m, tmp_path):
     assert camera.depth.baseline_m == pytest.approx(baseline_m)
 
 
-def test_depth_of_the_scans_is_left_to_who_takes_them(drive):
+def test_the_depth_of_scans_is_left_to_the_importer(drive):
     assert events_of(drive, RecordedPicture, "lidar")[0].depth is None
 
 
@@ -181,12 +181,13 @@ def test_frames_that_lack_a_picture_or_a_whole_scan_are_counted(drive):
         "sgbm (2 of 3 images have a right one), lidar (3 scans)"
     )
     assert [(b.kind, b.why) for b in bad] == [
-        ("image", without_right), ("scan", "its size is not a multiple of 16 bytes (rows of four float32): truncated")
-    ]  # fmt: skip
+        ("image", without_right),
+        ("scan", "its size is not a multiple of 16 bytes (rows of four float32): truncated"),
+    ]
     assert bad[1].name.startswith("velodyne 0000")
 
 
-def test_pictures_that_are_broken_alike_are_counted_as_one(drive):
+def test_images_with_the_same_defect_are_counted_together(drive):
     for path in [*drive.glob("depth_2/*"), *drive.glob("proj_depth/groundtruth/image_02/*")]:
         path.write_bytes(path.read_bytes()[:60])
     bad = events_of(drive, Unusable, "stored")
@@ -382,7 +383,7 @@ def test_a_scan_that_vanishes_during_an_import_is_an_error_and_a_picture_is_left
 
 
 def test_points_of_a_raw_drive_have_times_by_azimuth_and_those_of_a_sequence_have_none(drive):
-    """A tenth of a second a turn: the rear first, the front at the stamp."""
+    """A turn takes 0.1 s. It begins at the rear, and the front is at the stamp."""
     offsets = events_of(drive, RecordedScan)[1].offsets_s
     if "sync" not in drive.name:  # KITTI's odometry scans are compensated already
         assert offsets is None

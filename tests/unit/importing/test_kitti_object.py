@@ -13,7 +13,7 @@ def scan_of(training, name):
 
 
 def pixels_by_kitti(calib_path, points_lidar):
-    """KITTI's own formula, P2 R0 Tr x: an independent way to the pixel."""
+    """Project by KITTI's own formula, P2 R0 Tr x, as an independent reference."""
     rows = dict(line.split(":") for line in calib_path.read_text().splitlines() if line)
     P2, R0, Tr = (np.array(rows[key].split(), float).reshape(3, -1) for key in ("P2", "R0_rect", "Tr_velo_to_cam"))
     homogeneous = np.column_stack([points_lidar, np.ones(len(points_lidar))])
@@ -89,7 +89,7 @@ def test_frames_elsewhere_without_stored_depth_are_skipped_with_the_remedy(kitti
     assert "--depth sgbm" in summary.skipped[0]
 
 
-def test_progress_is_told_for_every_frame(kitti, tmp_path):
+def test_progress_is_reported_for_every_frame(kitti, tmp_path):
     told = []
     import_kitti_object(kitti, tmp_path / "out", depth="sgbm", progress=lambda done, total: told.append((done, total)))
     assert told == [(1, 4), (2, 4), (3, 4), (4, 4)]
@@ -160,9 +160,11 @@ DEFECTS = [
     ("stored", "calib/000003.txt", without_P2),
     ("stored", "calib/000003.txt", with_a_word),
     ("stored", "calib/000003.txt", mirrored),
-    *[("stored", f"{kind}/000003.{end}", lambda path: path.unlink()) for kind, end in (
-        ("image_2", "png"), ("gt_depth", "png"), ("calib", "txt"))],
-]  # fmt: skip
+    *[
+        ("stored", f"{kind}/000003.{end}", lambda path: path.unlink())
+        for kind, end in (("image_2", "png"), ("gt_depth", "png"), ("calib", "txt"))
+    ],
+]
 
 
 @pytest.mark.parametrize(("depth", "file", "damage"), DEFECTS)

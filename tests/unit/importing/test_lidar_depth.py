@@ -9,7 +9,7 @@ HERE = np.eye(4)
 
 
 def rays(step=4, jitter=0.0):
-    """Directions through a grid of pixels, z = 1."""
+    """Return directions through a grid of pixels, z = 1."""
     u, v = (a.ravel().astype(float) for a in np.meshgrid(np.arange(2, 63, step), np.arange(2, 47, step)))
     rng = np.random.default_rng(0)
     u, v = (a + rng.uniform(-jitter, jitter, len(a)) for a in (u, v))
@@ -58,7 +58,7 @@ def test_points_behind_what_the_camera_sees_are_dropped():
     assert set(np.unique(np.round(depth[depth > 0], 3))) == {4.0}
 
 
-def test_what_is_behind_the_camera_or_too_little_gives_no_depth():
+def test_points_behind_the_camera_or_too_few_points_give_no_depth():
     assert not depth_from_scan(rays() * -5.0, HERE, CAMERA).any()
     assert not depth_from_scan(rays()[:3] * 5.0, HERE, CAMERA).any()
     assert not depth_from_scan(np.zeros((0, 3)), HERE, CAMERA).any()

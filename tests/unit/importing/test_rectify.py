@@ -25,8 +25,8 @@ def project(points, camera, lens):
 
 
 @pytest.mark.parametrize(("lens", "distortion"), [("pinhole", PLUMB_BOB), ("fisheye", FISHEYE)])
-def test_what_a_lens_bent_lies_where_a_pinhole_sees_it(picture_at, lens, distortion):
-    """The recorded picture's grey levels are its own pixel coordinates: the rectified one then tells where each came from."""
+def test_distorted_pixels_are_rectified_to_a_pinhole(picture_at, lens, distortion):
+    """Grey levels of the recorded image are its pixel coordinates. So the rectified image shows the source of each pixel."""
     camera = camera_of(distortion)
     v, u = np.mgrid[0 : SIZE[0], 0 : SIZE[1]]
     rgb = np.stack([u, v, np.full(SIZE, 7)], axis=-1).astype(np.uint8)

@@ -22,7 +22,7 @@ def write_pair(rgb, depth, steps):
 
 @pytest.fixture
 def tum(tmp_path):
-    """Three pairs a metre ahead by a metre, the depth of the third too late."""
+    """Write three pairs, a metre apart along the view. The depth of the third is too late."""
     lists = {"rgb.txt": "# colour\n", "depth.txt": "# depth\n", "groundtruth.txt": "# truth\n"}
     for k, late in enumerate((0.0, 0.015, 0.05)):
         write_pair(tmp_path / "rgb" / f"{k}.png", tmp_path / "depth" / f"{k}.png", 10_000)
@@ -78,7 +78,7 @@ def test_tums_truth_is_of_the_optical_frame_and_becomes_that_of_the_body(tum):
         ("groundtruth.txt", "0 0 0\n", "groundtruth.txt, line 1"),
     ],
 )
-def test_what_tums_lists_lack_is_named(tum, file, text, why):
+def test_missing_entries_of_tum_lists_are_named(tum, file, text, why):
     (tum / file).unlink() if text is None else (tum / file).write_text(text)
     with pytest.raises(DatasetError, match=why):
         open_tum_rgbd(tum, CAMERA)
@@ -128,7 +128,7 @@ def test_as_much_depth_as_colour_is_wanted(open3d):
         open_open3d(open3d, None)
 
 
-def test_pictures_that_are_broken_or_of_another_size_are_counted_alike(open3d):
+def test_damaged_images_and_images_of_another_size_are_counted_together(open3d):
     for k in range(2):
         path = open3d / "depth" / f"{k:05d}.png"
         path.write_bytes(path.read_bytes()[:30])

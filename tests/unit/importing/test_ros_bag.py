@@ -1,4 +1,4 @@
-"""Bags that lack something, or are damaged, and what is made of their poses."""
+"""Bags with missing or damaged parts, and the poses from bags."""
 
 import tracemalloc
 from pathlib import Path
@@ -27,7 +27,7 @@ def at(x):
 
 @pytest.fixture
 def drive(ros):
-    """Messages of a drive of ten scans and as many picture pairs; ``without`` leaves topics out."""
+    """Return the messages of a drive with ten scans and ten image pairs; ``without`` omits topics."""
 
     def made(*, without=(), count=10, mountings=None):
         edges = (
@@ -121,7 +121,7 @@ def test_without_poses_there_is_no_trajectory_and_the_lidar_is_the_vehicle(ros, 
     assert bag.lidar.T_vehicle_sensor == np.eye(4).tolist()
 
 
-def test_a_missing_mounting_is_named_and_may_be_told(ros, drive, tmp_path):
+def test_a_missing_mounting_is_named_and_can_be_given(ros, drive, tmp_path):
     path = ros.write(tmp_path / "bag", drive(mountings=[("base_link", "lidar", T_LIDAR)]))
     with pytest.raises(
         DatasetError, match=r"no transform from 'lidar' to 'camera'; give T_vehicle_camera .*--extrinsics"
@@ -138,7 +138,7 @@ def test_a_missing_mounting_is_named_and_may_be_told(ros, drive, tmp_path):
         opened(path)
 
 
-def test_a_camera_that_is_mounted_on_the_lidar_follows_the_lidars_told_mounting(ros, drive, tmp_path):
+def test_a_camera_mounted_on_the_lidar_uses_the_given_mounting_of_the_lidar(ros, drive, tmp_path):
     T_lidar_camera = np.linalg.inv(T_LIDAR) @ T_CAMERA
     path = ros.write(tmp_path / "bag", drive(mountings=[("lidar", "camera", T_lidar_camera)]))
     bag = opened(path, extrinsics=Extrinsics(T_vehicle_lidar=T_LIDAR))
@@ -147,13 +147,13 @@ def test_a_camera_that_is_mounted_on_the_lidar_follows_the_lidars_told_mounting(
 
 
 def with_poses(ros, drive, message_of):
-    """The drive with other poses than odometry's."""
+    """Return the drive with poses other than those of the odometry."""
     extra = [(topic, 0.1 * k, message) for k in range(10) for topic, message in [message_of(k, 0.1 * k)]]
     messages = [*drive(without={"/odom", *PICTURES}), *extra]
     return sorted(messages, key=lambda message: message[1])
 
 
-def test_stamped_poses_are_taken_for_the_lidars_and_it_says_so(ros, drive, tmp_path):
+def test_stamped_poses_are_taken_as_lidar_poses_and_a_line_says_so(ros, drive, tmp_path):
     messages = with_poses(ros, drive, lambda k, s: ("/pose", ros.pose_stamped(s, at(k))))
     bag = opened(ros.write(tmp_path / "bag", messages))
     assert "poses are of: the LiDAR (assumed: the topic does not say)" in bag.notes.lines
@@ -163,7 +163,7 @@ def test_stamped_poses_are_taken_for_the_lidars_and_it_says_so(ros, drive, tmp_p
     np.testing.assert_allclose(told.lidar.T_vehicle_sensor, T_LIDAR)
 
 
-def test_poses_by_tf_are_the_lidars_own_and_the_same_map_with_a_told_mounting(ros, drive, tmp_path):
+def test_poses_from_tf_are_those_of_the_lidar_also_with_a_given_mounting(ros, drive, tmp_path):
     messages = with_poses(ros, drive, lambda k, s: ("/tf", ros.tf(ros.edge(s, "odom", "base_link", at(k)))))
     path = ros.write(tmp_path / "bag", messages)
     for told in (Extrinsics(), Extrinsics(T_vehicle_lidar=at(3))):
@@ -172,7 +172,7 @@ def test_poses_by_tf_are_the_lidars_own_and_the_same_map_with_a_told_mounting(ro
         np.testing.assert_allclose(T_map_lidar, np.stack([at(k) @ T_LIDAR for k in range(10)]), atol=1e-9)
 
 
-def test_a_lidar_that_tf_does_not_know_stands_where_it_is_told(ros, drive, tmp_path):
+def test_a_lidar_missing_in_tf_uses_the_given_mounting(ros, drive, tmp_path):
     messages = with_poses(ros, drive, lambda k, s: ("/tf", ros.tf(ros.edge(s, "odom", "base_link", at(k)))))
     path = ros.write(tmp_path / "bag", [m for m in messages if m[0] != "/tf_static"])
     assert opened(path).trajectory() is None

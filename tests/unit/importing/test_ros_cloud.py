@@ -11,7 +11,7 @@ STAMP_S = 1_700_000_000.25
 
 
 def cloud(layout, step, values, *, big=False, height=1, row_padding=0, **changed):
-    """A message of ``values`` by field name, each of height x width numbers; what lies between the fields is rubbish."""
+    """Return a message with ``values`` by field name, height x width numbers each. Padding between fields is random."""
     order = ">" if big else "<"
     width = len(next(iter(values.values()))) // height
     rng = np.random.default_rng(0)
@@ -26,9 +26,14 @@ def cloud(layout, step, values, *, big=False, height=1, row_padding=0, **changed
                     data[at : at + len(raw)] = raw
     fields = [Message(name=name, offset=offset, datatype=TYPES.get(kind, 99), count=1) for name, kind, offset in layout]
     told = {
-        "height": height, "width": width, "fields": fields, "is_bigendian": big, "point_step": step, "row_step": width * step + row_padding,
+        "height": height,
+        "width": width,
+        "fields": fields,
+        "is_bigendian": big,
+        "point_step": step,
+        "row_step": width * step + row_padding,
         "data": data,
-    }  # fmt: skip
+    }
     return Message(**(told | changed))
 
 

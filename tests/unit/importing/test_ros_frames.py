@@ -12,7 +12,7 @@ def moved(x=0.0, turn=0.0):
 @pytest.fixture
 def tree_of(ros):
     def made(*edges):
-        """Of (parent, child, T), fixed, or (parent, child, T, seconds), moving."""
+        """Return frames from (parent, child, T), static, or (parent, child, T, seconds), dynamic."""
         tree = FrameTree()
         for parent, child, T, *stamp in edges:
             tree.add(ros.edge(stamp[0] if stamp else 0.0, parent, child, T), static=not stamp)
@@ -46,11 +46,11 @@ def test_a_way_over_an_edge_that_moves_is_none(tree_of):
     assert tree.fixed("base", "camera") is None
 
 
-def test_an_edge_that_was_told_once_stands_still(tree_of):
+def test_an_edge_with_one_message_is_static(tree_of):
     np.testing.assert_allclose(tree_of(("base", "lidar", moved(1.0), 3.0)).fixed("base", "lidar"), moved(1.0))
 
 
-def test_a_static_edge_told_again_counts_as_told_last(tree_of):
+def test_the_last_message_of_a_static_edge_counts(tree_of):
     tree = tree_of(("base", "lidar", moved(1.0)), ("base", "lidar", moved(2.0)))
     np.testing.assert_allclose(tree.fixed("base", "lidar"), moved(2.0))
 
@@ -78,7 +78,7 @@ def test_only_the_time_that_all_edges_cover_is_given(tree_of):
     assert trajectory.stamps_s.tolist() == [1.0, 1.5]
 
 
-def test_what_does_not_rise_or_is_no_number_is_not_taken(ros):
+def test_edges_with_a_repeated_stamp_or_an_invalid_pose_are_ignored(ros):
     tree = FrameTree()
     nan = ros.edge(1.0, "a", "b", moved(np.nan))
     zero = ros.edge(2.0, "a", "b", moved())

@@ -67,10 +67,15 @@ def test_depth_of_both_encodings_comes_as_it_is(encoding, values, big, padding):
 @pytest.mark.parametrize("reader", [colour_of, depth_of])
 @pytest.mark.parametrize(
     ("changed", "why"),
-    [({"encoding": "bayer_rggb8"}, "unknown encoding 'bayer_rggb8' (known:"), ({"height": 4}, "truncated"), ({"step": 2}, "truncated"),
-     ({"width": 0}, "is 0, or over the limit"), ({"height": 10**6, "width": 10**6}, "over the limit")],
-)  # fmt: skip
-def test_a_picture_that_cannot_be_read_says_why(reader, changed, why):
+    [
+        ({"encoding": "bayer_rggb8"}, "unknown encoding 'bayer_rggb8' (known:"),
+        ({"height": 4}, "truncated"),
+        ({"step": 2}, "truncated"),
+        ({"width": 0}, "is 0, or over the limit"),
+        ({"height": 10**6, "width": 10**6}, "over the limit"),
+    ],
+)
+def test_an_unreadable_image_gives_a_reason(reader, changed, why):
     good = image(RGB, "rgb8") if reader is colour_of else image(np.ones((3, 5), np.uint16), "16UC1")
     assert why in reader(Message(**(vars(good) | changed)))
 
@@ -126,7 +131,7 @@ def test_a_fisheye_is_known_by_its_model():
         ({"d": [np.nan, 1, 0, 0]}, "finite"),
     ],
 )
-def test_a_camera_info_that_tells_no_camera_says_why(changed, why):
+def test_an_unusable_camera_info_gives_a_reason(changed, why):
     assert why in camera_of(info(**changed), is_rectified=False)
 
 

@@ -21,9 +21,14 @@ def chosen(available, told=None):
 
 def test_colour_depth_and_camera_of_one_namespace_go_together():
     available = [
-        info("/rear/color/camera_info"), info("/front/color/camera_info"), image("/front/color/image_raw", 20), image("/rear/depth/image"),
-        image("/front/depth/image"), image("/front/aligned_depth_to_color/image_raw"), image("/front/infra1/image", 99),
-    ]  # fmt: skip
+        info("/rear/color/camera_info"),
+        info("/front/color/camera_info"),
+        image("/front/color/image_raw", 20),
+        image("/rear/depth/image"),
+        image("/front/depth/image"),
+        image("/front/aligned_depth_to_color/image_raw"),
+        image("/front/infra1/image", 99),
+    ]
     expected = {
         "color": "/front/color/image_raw",
         "depth": "/front/aligned_depth_to_color/image_raw",
@@ -49,7 +54,7 @@ def test_mountings_alone_are_no_poses_and_empty_topics_are_none():
     assert chosen(available)["poses"] is None
 
 
-def test_what_is_told_is_not_guessed_and_lines_say_which():
+def test_given_values_are_not_guessed_and_lines_list_them():
     available = [image("/a"), image("/b", 99)]
     topics = topics_of([SCAN, *available], {"color": "/a"}, source="x")
     assert topics.lines()[:2] == ("scan: /points, 10 x PointCloud2 (guessed)", "color: /a, 10 x Image")

@@ -1,4 +1,4 @@
-"""Times by azimuth, and beams whose angles are off."""
+"""Times by azimuth, and beams with angle errors."""
 
 import numpy as np
 import pytest
@@ -19,7 +19,7 @@ def test_a_turn_begins_at_the_rear_goes_over_the_left_and_faces_ahead_at_the_sta
 
 
 def test_a_ring_seen_from_a_moving_vehicle_is_round_again():
-    """Ten metres a second and a bend: a wall of points all round, each seen from where the vehicle then was."""
+    """At ten metres per second in a bend, the vehicle sees each point of a round wall from its pose at that time."""
     stamps = np.linspace(-0.2, 0.2, 81)
     poses = np.stack([transform_from(rotation_z(0.5 * s), np.array([10.0 * s, 0, 0])) for s in stamps])
     trajectory = Trajectory(stamps, poses, "bend")

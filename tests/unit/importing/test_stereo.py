@@ -1,4 +1,4 @@
-"""Depth of a rectified pair: a picture that is the other one shifted has the same disparity everywhere."""
+"""Depth of a rectified pair: a shifted image has the same disparity everywhere."""
 
 import numpy as np
 import pytest
@@ -10,7 +10,7 @@ MATCHING = StereoMatching(disparities=64)
 
 
 def pair(disparity: int, *, width: int = 320, height: int = 120) -> tuple[np.ndarray, np.ndarray]:
-    """A textured plane that faces both cameras."""
+    """Return a textured plane parallel to both image planes."""
     texture = np.random.default_rng(0).integers(0, 255, (height, width + disparity, 3), np.uint8)
     return texture[:, :width].copy(), texture[:, disparity:].copy()
 
@@ -26,7 +26,7 @@ def test_the_left_of_the_picture_is_measured_where_the_right_picture_shows_it(di
 
 
 def test_no_match_is_taken_from_beyond_the_right_picture() -> None:
-    """A pixel of column u has no larger disparity than u."""
+    """A pixel of column u has no disparity larger than u."""
     left, right = pair(20)
     depth_m = depth_from_stereo(left, right, focal_baseline_px_m=FOCAL_BASELINE, matching=MATCHING)
     v, u = np.nonzero(depth_m)

@@ -13,7 +13,7 @@ from service.geometry.rigid import R_BODY_OPTICAL, transform_from
 
 @pytest.fixture
 def taken(recording_of, straight, tmp_path):
-    """Takes events with a straight trajectory; gives the summary and the dataset."""
+    """Take events with a straight trajectory; return the summary and the dataset."""
 
     def made(events, **settings):
         summary = take(recording_of(events), straight(), tmp_path / "out", TakeSettings(**settings))
@@ -34,7 +34,7 @@ def test_scans_and_pictures_stand_where_the_trajectory_was(taken, scan_at, pictu
     assert dataset.description.source["poses"] == "straight on"
 
 
-def test_what_cannot_be_used_is_counted_by_reason_with_the_first_name(taken, scan_at, picture_at):
+def test_unusable_items_are_counted_by_reason_with_the_first_name(taken, scan_at, picture_at):
     nan = [[np.nan, 0, 0, 0]]
     events = [
         scan_at(0.5),
@@ -83,7 +83,7 @@ def test_a_turns_motion_is_taken_out_unless_it_is_to_stay(recording_of, straight
         np.testing.assert_allclose(Dataset(out).scan(0)[:, 0], [5.0, x], atol=1e-4)
 
 
-def test_times_of_another_clock_leave_the_points_alone_and_are_told(taken, scan_at):
+def test_times_of_another_clock_do_not_change_the_points_and_are_reported(taken, scan_at):
     summary, dataset = taken([scan_at(1.0, points=[[5, 0, 0, 0]], offsets_s=[523.0])])
     np.testing.assert_array_equal(dataset.scan(0), [[5, 0, 0, 0]])
     assert summary.dropped == ("1 de-skew: its points' times are more than 1 s from its stamp (first: scan at 1)",)
@@ -111,7 +111,7 @@ def test_a_picture_belongs_to_the_nearest_scan_also_when_that_comes_later(taken,
 def test_pictures_without_any_scan_after_them_wait_in_bounded_number(
     recording_of, straight, scan_at, picture_at, tmp_path
 ):
-    """A drive whose pictures all come at the end, as ``convert`` writes it: they are answered as they come."""
+    """All images of the drive come at the end, as ``convert`` writes it. Each becomes a query as it arrives."""
     waiting = []
 
     def events():
@@ -133,7 +133,7 @@ def test_pictures_are_left_out_where_no_query_set_is_wanted(taken, scan_at, pict
 
 
 def wall_scan(scan_at, stamp_s, x):
-    """A wall across the way, ``x`` metres ahead of the LiDAR."""
+    """Return a scan of a wall across the road, ``x`` metres ahead of the LiDAR."""
     y, z = (a.ravel() for a in np.meshgrid(np.linspace(-4, 4, 60), np.linspace(-3, 3, 60)))
     return scan_at(stamp_s, points=np.c_[np.full(y.shape, x), y, z, np.zeros(y.shape)])
 
@@ -225,14 +225,14 @@ def test_millimetres_as_floats_are_left_out_with_the_unit(taken, scan_at, pictur
     )
 
 
-def test_progress_is_told_after_every_frame(recording_of, straight, scan_at, tmp_path):
+def test_progress_is_reported_after_every_frame(recording_of, straight, scan_at, tmp_path):
     told = []
     events = [scan_at(1.0), Unusable("scan", "x", "y"), scan_at(2.0)]
     take(recording_of(events), straight(), tmp_path / "out", TakeSettings(), report=lambda *each: told.append(each))
     assert told == [("frames", 1, 10), ("frames", 2, 10), ("frames", 3, 10)]
 
 
-def test_what_a_dataset_says_of_itself_is_json_that_names_the_lidar(taken, scan_at):
+def test_the_dataset_description_is_json_with_the_lidar(taken, scan_at):
     _, dataset = taken([scan_at(1.0)])
     told = json.loads((dataset.folder / "dataset.json").read_text())
     assert told["sensors"]["lidars"][0]["name"] == "listed"

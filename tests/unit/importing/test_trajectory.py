@@ -60,8 +60,8 @@ number = st.floats(-3, 3)
 
 
 @given(st.tuples(number, number, number), st.tuples(number, number, number), st.floats(0, 1))
-def test_constant_turn_and_speed_are_met_exactly(turn_rad_s, speed_m_s, stamp_s):
-    """At two poses a tenth of a second apart, a rotation by slerp and a position in a line are the motion itself."""
+def test_constant_rotation_and_speed_are_interpolated_exactly(turn_rad_s, speed_m_s, stamp_s):
+    """For poses 0.1 s apart, slerp of the rotation and linear interpolation of the position are exact."""
     stamps = np.linspace(0, 1, 11)
 
     def pose(s):

@@ -15,7 +15,7 @@ PAYLOADS = [Payload(b"", "", pb.LocalizeRequest(), np.array([float(k), 0, 0])) f
 
 
 class Fake:
-    """Answers after a while; remembers what it was asked."""
+    """Answers after a delay, and records the requests."""
 
     def __init__(self, replies=None, *, takes_s=0.0):
         self.asked, self._replies, self._takes_s = [], replies, takes_s
@@ -42,7 +42,7 @@ class Fake:
 
 
 def test_arrivals_are_a_poisson_process():
-    """Their number has the rate's mean and variance, their gaps an exponential's spread, and the seed decides."""
+    """Their number has the mean and variance of the rate, their gaps are exponential, and the seed determines them."""
     counts = [len(arrivals(50, 10, seed)) for seed in range(200)]
     assert np.mean(counts) == pytest.approx(500, abs=6)
     assert np.var(counts) == pytest.approx(500, rel=0.3)
@@ -53,7 +53,7 @@ def test_arrivals_are_a_poisson_process():
 
 
 def test_arrivals_do_not_wait_for_answers():
-    """Forty a second of 0.5 s each need twenty at once, although nobody said so."""
+    """Forty per second of 0.5 s each need twenty at once, although no option sets this number."""
     target = Fake(takes_s=0.5)
     shots = asyncio.run(drive(target, PAYLOADS, Load(rate=40, warm_up_s=0, duration_s=1)))
     assert [shot.due_s for shot in shots] == arrivals(40, 1, 0)
@@ -70,7 +70,7 @@ def test_clients_wait_for_answers():
 
 
 def test_latency_counts_from_when_a_request_was_due():
-    """A target that stops the whole generator for 0.3 s is charged for all that was due meanwhile."""
+    """A target blocks the generator for 0.3 s. All requests due meanwhile count with their delay."""
 
     class Stops(Fake):
         async def ask(self, payload, timeout_s):
@@ -96,7 +96,7 @@ def test_a_generator_that_keeps_up_says_nothing_of_itself():
     assert "late" not in str(table_of([found]).caption)
 
 
-def test_the_summary_counts_what_came_of_it():
+def test_the_summary_counts_the_outcomes():
     def reply(number):
         return {0: Reply("503"), 1: Reply("ok", "AMBIGUOUS", (9.0, 0.0, 0.0))}.get(
             number % 4, Reply("ok", "LOCALIZED", (0.5, 0.0, 5.0))
@@ -118,7 +118,7 @@ def test_the_summary_counts_what_came_of_it():
 
 
 def test_answers_that_come_after_the_load_are_no_throughput():
-    """A service of ten a second, offered twenty: what waits at the end is answered, but not within the second."""
+    """The service answers ten per second, the load is twenty. Requests left at the end are answered, but too late to count."""
 
     class Queue(Fake):
         async def ask(self, payload, timeout_s):

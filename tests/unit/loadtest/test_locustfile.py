@@ -1,4 +1,4 @@
-"""With a stand-in for Locust, which the project does not install."""
+"""A fake Locust, which the project does not install."""
 
 import importlib
 import sys

@@ -1,4 +1,4 @@
-"""Places that registration verifies come before places that only look alike."""
+"""Places that registration verifies come before perceptual aliases."""
 
 from collections.abc import Callable
 

@@ -73,20 +73,20 @@ def test_with_registration_the_pose_is_where_the_picture_was_taken(localizer: Lo
     assert (np.linalg.eigvalsh(answer.covariance) > 0).all()
 
 
-def test_a_registered_position_says_which_street_it_lies_in(
+def test_the_registered_position_determines_the_street(
     content_of: Callable[..., BundleContent], content: BundleContent, tmp_path: Path, query: Query
 ) -> None:
-    """All places are said to lie in street 0; the picture's own position lies in street 2."""
+    """All places are in street 0. The position of the query is in street 2."""
     write_bundle(tmp_path / "m", content_of(place_street=np.zeros(12, np.int32)))
     localizer = Localizer.open(MapBundle.open(tmp_path / "m"))
     registered, voted = (localizer.localize(replace(query, refine=refine)) for refine in (True, False))
     assert (registered.street, voted.street) == (2, 0)
 
 
-def test_without_registration_the_heaviest_cluster_says_the_street_whatever_the_places_vote(
+def test_without_registration_the_heaviest_cluster_determines_the_street(
     localizer: Localizer, query: Query, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Places on both sides of a street's border vote across it; a cluster lies on one side."""
+    """Places on both sides of a street border disagree. A cluster lies on one side."""
     outvoted = StreetVote(street=1, share=0.6, shares=((1, 0.6), (2, 0.4)))
     monkeypatch.setattr("service.retrieval.retrieve.vote", lambda *_: outvoted)
     answer = localizer.localize(replace(query, refine=False))
@@ -222,7 +222,7 @@ def test_a_calibrated_map_says_how_sure_it_is_and_accepts_by_the_rate_asked_for(
     rate: float,
     status: str,
 ) -> None:
-    """Even odds whatever the evidence: above the threshold of 0.4 for one in a hundred, below the 0.9 for one in a thousand."""
+    """All queries get 0.5: above the threshold 0.4 for a rate of 1 %, below 0.9 for 0.1 %."""
     write_bundle(tmp_path / "m", content_of(calibration=calibration_json()))
     localizer = Localizer.open(MapBundle.open(tmp_path / "m"))
     answer = localizer.localize(replace(query, false_accept_rate=rate))
@@ -240,7 +240,7 @@ def test_a_calibrated_map_says_how_sure_it_is_and_accepts_by_the_rate_asked_for(
 def calibrated(
     content_of: Callable[..., BundleContent], calibration_json: Callable[..., dict[str, Any]], tmp_path: Path
 ) -> Localizer:
-    """A map whose calibration gives even odds whatever the evidence."""
+    """Return a map with a calibration that gives 0.5 for all features."""
     write_bundle(tmp_path / "m", content_of(calibration=calibration_json()))
     return Localizer.open(MapBundle.open(tmp_path / "m"))
 
@@ -273,7 +273,7 @@ def test_one_frame_of_a_sequence_is_answered_like_a_single_query(localizer: Loca
 
 
 def test_a_sequence_is_answered_with_the_pose_of_its_first_frame(localizer: Localizer, query: Query) -> None:
-    """The second frame is said to have been taken 5 m behind the first, in the same place: so the first stands 5 m ahead."""
+    """The second frame was taken 5 m behind the first, at the same place. So the first is 5 m ahead."""
     behind = transform_from(np.eye(3), np.array([0.0, 0.0, -5.0]))
     few = np.zeros_like(query.depth_m)
     few[20:23, 20:24] = query.depth_m[20:23, 20:24]  # enough to be looked up, nothing to register
@@ -304,7 +304,7 @@ def test_a_prior_that_is_wrong_does_not_move_a_pose_that_the_pictures_are_sure_o
 
 
 @pytest.mark.parametrize("y", [0.0, 90.0])
-def test_a_prior_decides_between_streets_that_nothing_else_tells_apart(twin_map: Path, query: Query, y: float) -> None:
+def test_a_prior_decides_between_identical_streets(twin_map: Path, query: Query, y: float) -> None:
     localizer = Localizer.open(MapBundle.open(twin_map))
     known = Prior(position_m=np.array([15.0, y + 5.0]), position_std_m=10.0)
     answer = localizer.localize(replace(query, prior=known))
@@ -317,11 +317,10 @@ def test_a_prior_that_is_wrong_lends_a_wrong_pose_no_confidence(
     tmp_path: Path,
     query: Query,
 ) -> None:
-    """Confidence that rises with the margin over rivals: a prior elsewhere leaves the answer right and no surer than before."""
-    margin = FEATURES.index("margin")
+    """Confidence rises with the margin over rivals. A prior elsewhere changes neither the answer nor its confidence."""
     document = calibration_json()
     for part in ("right", "known"):
-        document[part]["weights"][margin] = 3.0
+        document[part]["terms"] = [{"feature": "margin", "knots": [-4.0, 4.0], "log_odds": [-12.0, 12.0]}]
     write_bundle(tmp_path / "m", content_of(calibration=document))
     localizer = Localizer.open(MapBundle.open(tmp_path / "m"))
     alone = localizer.localize(query)
@@ -357,7 +356,7 @@ def test_a_prior_far_from_everything_leaves_retrieval_as_it_was(localizer: Local
 def test_a_prior_in_a_street_that_looks_the_same_but_measures_otherwise_does_not_win(
     streets_alike: Callable[..., Path], query: Query, seed: int
 ) -> None:
-    """In the first street, 90 m away, half of the depth at best lies on the map; where the picture was taken, all of it does."""
+    """In the first street, 90 m away, at most half of the depth fits the map. At the true place, all depth fits."""
     localizer = Localizer.open(MapBundle.open(streets_alike(seed_of_first=seed)))
     for wrong in (None, Prior(position_m=np.array([20.0, 0.0]), position_std_m=10.0)):
         answer = localizer.localize(replace(query, prior=wrong))

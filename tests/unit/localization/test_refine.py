@@ -32,12 +32,12 @@ BY_INLIERS = RegistrationSettings(similarity_weight=0.0)  # so that candidates o
 
 @pytest.fixture(scope="module")
 def cloud(scene_of, streets_at):
-    """The street, and 40 m beside it its like without lorry and pillar."""
+    """Return the street, and a copy 40 m beside it without lorry and pillar."""
     return scene_of(*streets_at(-6.0, 0.0), *streets_at(-6.0, 40.0)[:4]).survey()
 
 
 def taken(street, T_map_camera, *, seed=8):
-    """Depth with some noise."""
+    """Return the street's depth with noise."""
     inverse_depth = 1 / np.maximum(street.depth(CAMERA, T_map_camera), 1e-3)
     noise = np.random.default_rng(seed).normal(0, 1e-4, inverse_depth.shape)
     return (1 / (inverse_depth + noise)).astype(np.float32)
@@ -45,13 +45,13 @@ def taken(street, T_map_camera, *, seed=8):
 
 @pytest.fixture(scope="module")
 def depth(street):
-    """Taken in the street itself."""
+    """Return the depth at the true street."""
     return taken(street, TRUE)
 
 
 @pytest.fixture(scope="module")
 def bundle_like(bundle_at):
-    """Five places in the street beside, five in the true one; every view of a street is alike similar to (1, 0)."""
+    """Return five places in the street beside and five in the true one. All views have equal similarity to (1, 0)."""
 
     def bundle(beside, true):
         xyz = [(x, y, 1.8) for y in (40.0, 0.0) for x in range(5)]
@@ -68,7 +68,7 @@ def bundle(bundle_like):
 
 @pytest.fixture
 def both(matches_at):
-    """The similar views lie in the street beside the true one, and in the true one."""
+    """Return a bundle with similar views in the true street and the street beside it."""
     return matches_at([(0, 40, 1.8), (0, 0, 1.8)], [0, 0], [0.9, 0.4])
 
 
@@ -79,20 +79,25 @@ def here(matches_at):
 
 @pytest.fixture
 def seen_in(frame_with):
-    """A frame of a depth picture."""
+    """Return a frame from a depth image."""
 
     def frame(depth_m, matches, *, R_level_camera=R_LEVEL_CAMERA, T_reference_camera=None):
         noise = inverse_depth_noise(depth_m).total if depth_m.any() else 1e-4
         return frame_with(
-            matches, depth_m=depth_m, camera=CAMERA, R_level_camera=R_level_camera, height_m=1.5, noise=noise,
+            matches,
+            depth_m=depth_m,
+            camera=CAMERA,
+            R_level_camera=R_level_camera,
+            height_m=1.5,
+            noise=noise,
             T_reference_camera=T_reference_camera,
-        )  # fmt: skip
+        )
 
     return frame
 
 
 def always_refined(bundle, cloud, frames, prior, settings):
-    """Refine candidates of which at least one has an answer."""
+    """Refine, and require at least one candidate."""
     found = refine(bundle, cloud, frames, prior, settings)
     assert found is not None
     return found
@@ -135,7 +140,7 @@ def test_every_candidates_pose_is_its_cameras_and_the_covariance_the_firsts(bund
 def test_the_weight_of_the_similarity_decides_between_two_like_streets(
     bundle, cloud, depth, both, seen_in, weight, y_m
 ):
-    """The true street fits better; the views of the other one are more similar by 0.5."""
+    """The true street fits better. The views of the other street have a similarity larger by 0.5."""
     found = refined(bundle, cloud, seen_in(depth, both), inliers=1.0, similarity=weight, likelihood=0.0)
     inliers = {each.registered.hypothesis: each.registered.inliers for each in reversed(found.candidates)}
     assert inliers[0] < inliers[1] < inliers[0] + 0.5
@@ -152,7 +157,7 @@ def test_like_similarity_leaves_it_to_the_points(bundle_like, cloud, depth, both
 def test_similarity_is_of_the_places_around_the_pose_not_of_the_view_that_it_started_from(
     bundle, cloud, depth, matches_at, seen_in
 ):
-    """The start in the true street came by a match of 0.95, but what stands there is 0.4 similar."""
+    """The start in the true street came from a match of 0.95, but the places there have a similarity of 0.4."""
     found = refined(bundle, cloud, seen_in(depth, matches_at([(0, 0, 1.8)], [0], [0.95])))
     assert [each.scores["similarity"] for each in found.candidates] == pytest.approx(
         [0.4] * len(found.candidates), abs=1e-6
@@ -199,7 +204,7 @@ def test_a_picture_of_too_few_points_is_not_registered(bundle, cloud, depth, bot
 
 @pytest.fixture
 def judged(cloud, monkeypatch):
-    """The cloud with some brightness, and what brightness is then said to say of each pose that is asked about: its y."""
+    """Return the cloud with brightness. A fake brightness score of each pose is its y."""
     asked_y_m = []
 
     def brightness(scorer, poses):
@@ -214,7 +219,7 @@ def judged(cloud, monkeypatch):
 
 def test_brightness_decides_among_candidates_that_are_close(bundle_like, judged, depth, both, seen_in):
     lit, asked_y_m = judged
-    weights = {"inliers": 1.0, "similarity": 0.0, "likelihood": 0.0, "behind": 5.0}
+    weights = {"inliers": 1.0, "similarity": 0.0, "likelihood": 0.0, "brightness_gap": 5.0}
     without = refined(bundle_like(0.7, 0.7), lit, seen_in(depth, both), brightness=0.0, **weights)
     found = refined(bundle_like(0.7, 0.7), lit, seen_in(depth, both), brightness=0.1, **weights)
     assert without.best.T_map_camera[1, 3] == pytest.approx(0.5, abs=0.1)
@@ -226,10 +231,12 @@ def test_brightness_decides_among_candidates_that_are_close(bundle_like, judged,
         assert each.support == pytest.approx(each.registered.inliers + 0.1 * each.registered.camera_m[1])
 
 
-def test_who_is_far_behind_is_not_drawn_and_stays_behind(bundle_like, judged, depth, both, seen_in):
-    """By similarity the street beside is 9 nats behind; its brightness, which would make up for that, is not asked."""
+def test_a_candidate_with_a_large_support_gap_is_not_rendered_and_stays_behind(
+    bundle_like, judged, depth, both, seen_in
+):
+    """By similarity, the street beside has a gap of 9 nats. Its brightness would close the gap but is not computed."""
     lit, asked_y_m = judged
-    weights = {"inliers": 1.0, "similarity": 30.0, "likelihood": 0.0, "behind": 5.0}
+    weights = {"inliers": 1.0, "similarity": 30.0, "likelihood": 0.0, "brightness_gap": 5.0}
     unlit = refined(bundle_like(0.4, 0.7), replace(lit, brightness=None), seen_in(depth, both), **weights)
     assert asked_y_m == []
     found = refined(bundle_like(0.4, 0.7), lit, seen_in(depth, both), brightness=10.0, **weights)
@@ -239,16 +246,16 @@ def test_who_is_far_behind_is_not_drawn_and_stays_behind(bundle_like, judged, de
     assert max(beside[1]) <= max(beside[0]) + 1e-9 < -5
 
 
-def test_the_picture_tells_two_streets_apart_that_differ_in_paint_alone(bundle_like, cloud, depth, both, seen_in):
-    """The map's own brightness as the true pose shows it, as a picture of other size and sign."""
+def test_brightness_decides_between_two_streets_with_equal_depth(bundle_like, cloud, depth, both, seen_in):
+    """The brightness of the map at the true pose, as an image of another scale and sign."""
     rng = np.random.default_rng(2)
     lit = replace(cloud, brightness=rng.uniform(0.05, 1.0, len(cloud.surfels)).astype(np.float32))
     frame = seen_in(depth, both)
     camera = CAMERA.scaled_to(160, 120)
     T = TRUE.copy()
     T[:3, 3] -= lit.origin_m
-    met = SurfelRaycaster(lit, RaySettings()).meet(T, camera)
-    grey = np.where(met >= 0, 255 - 200 * lit.brightness[np.maximum(met, 0)], 128).astype(np.uint8)
+    surfel_of = SurfelRaycaster(lit, RaySettings()).intersect(T, camera)
+    grey = np.where(surfel_of >= 0, 255 - 200 * lit.brightness[np.maximum(surfel_of, 0)], 128).astype(np.uint8)
     frame = replace(frame, query=replace(frame.query, rgb=np.repeat(grey[..., None], 3, axis=2)))
     weights = {"inliers": 1.0, "similarity": 2.0, "likelihood": 0.0}
     blind, found = (refined(bundle_like(0.9, 0.4), each, frame, brightness=30.0, **weights) for each in (cloud, lit))
@@ -256,16 +263,17 @@ def test_the_picture_tells_two_streets_apart_that_differ_in_paint_alone(bundle_l
     np.testing.assert_allclose(found.best.T_map_camera[:3, 3], TRUE[:3, 3], atol=0.05)
 
 
-def test_a_noisy_pictures_best_pose_is_looked_around_and_moves_to_what_shows_the_paint(
+def test_a_noisy_query_triggers_a_local_search_and_moves_to_the_best_brightness(
     bundle_like, cloud, depth, here, seen_in, monkeypatch
 ):
-    """Points say nothing between poses along a bare street; brightness is said to be best 1.4 m ahead of where registration ends."""
+    """Points do not constrain the position along a bare street. The brightness score is largest 1.4 m ahead of the result."""
     lit = replace(cloud, brightness=np.ones(len(cloud.surfels), np.float32))
     ahead = TRUE[:3, 3] + 1.4 * np.array([np.cos(np.deg2rad(HEADING_DEG)), np.sin(np.deg2rad(HEADING_DEG)), 0])
     monkeypatch.setattr(
-        BrightnessScorer, "score",
+        BrightnessScorer,
+        "score",
         lambda _, poses: Scores(np.array([-np.linalg.norm(pose.camera_m - ahead) for pose in poses])),
-    )  # fmt: skip
+    )
     near = [LocalPose(each, 0.5) for each in _shifted(refined(bundle_like(0.4, 0.9), lit, seen_in(depth, here)))]
     monkeypatch.setattr(refining, "search_locally", lambda *_: near)
     still = RaySettings(fewest=10**6)  # nothing is adjusted
@@ -290,7 +298,7 @@ def test_a_noisy_pictures_best_pose_is_looked_around_and_moves_to_what_shows_the
 
 
 def _registered_by(bundle, lit, frame):
-    """What registration alone makes of a frame."""
+    """Return the result of registration alone."""
     return always_refined(
         bundle, replace(lit, brightness=None), (frame,), None, RefineSettings(rays=RaySettings(fewest=10**6))
     ).best.registered
@@ -322,13 +330,13 @@ def test_two_frames_together_are_found_where_the_reference_was_taken(bundle, clo
     assert found.points == sum(alone)
 
 
-def test_what_another_frame_saw_finds_a_reference_that_saw_nothing(bundle, cloud, depth, here, two_frames, seen_in):
+def test_another_frame_localizes_a_reference_without_matches(bundle, cloud, depth, here, two_frames, seen_in):
     found = refined(bundle, cloud, seen_in(np.zeros_like(depth), here), two_frames[1])
     np.testing.assert_allclose(found.best.T_map_camera, TRUE, atol=0.1)
     assert found.best.scores["through"] < 0.02
 
 
-def test_agreement_is_the_mean_of_what_each_frame_sees_from_where_it_stood(bundle, cloud, two_frames, matches_at):
+def test_agreement_is_the_mean_over_frames_at_their_own_poses(bundle, cloud, two_frames, matches_at):
     found = refined(bundle, cloud, *two_frames).best
     alone = []
     for frame, T_true, heading_deg in zip(two_frames, (TRUE, OTHER), (5, 25), strict=True):
@@ -340,8 +348,8 @@ def test_agreement_is_the_mean_of_what_each_frame_sees_from_where_it_stood(bundl
         assert found.scores[name] == pytest.approx(np.mean([each[name] for each in alone]), abs=off)
 
 
-def test_it_does_not_matter_in_which_level_frame_a_frame_is_told(bundle, cloud, two_frames, matches_at):
-    """The second one's turned by a right angle, and the heading of what it resembles with it."""
+def test_the_choice_of_the_level_frame_does_not_matter(bundle, cloud, two_frames, matches_at):
+    """The level frame of the second frame is rotated by a right angle, and so are the headings of its matches."""
     other = two_frames[1]
     views = replace(other.views, R_level_camera=rotation_z(np.pi / 2) @ other.R_level_camera)
     turned = replace(other, views=views, matches=matches_at([(0, 0, 1.8)], [-90], [0.9]))
@@ -352,14 +360,14 @@ def test_it_does_not_matter_in_which_level_frame_a_frame_is_told(bundle, cloud, 
 
 
 def test_similarity_is_the_mean_over_frames(bundle, cloud, two_frames):
-    """In the true street, whose views are (0.4, 0.917), a frame of (1, 0) is 0.4 similar and one of (0, 1) 0.917."""
+    """In the true street with views (0.4, 0.917), a frame (1, 0) has the similarity 0.4 and a frame (0, 1) 0.917."""
     across = replace(two_frames[1], descriptors=np.array([[0.0, 1.0]], np.float32))
     found = refined(bundle, cloud, two_frames[0], across)
     assert found.best.scores["similarity"] == pytest.approx((0.4 + np.sqrt(0.84)) / 2, abs=1e-6)
 
 
 def test_how_far_the_places_are_is_the_mean_over_frames(bundle, cloud, two_frames, monkeypatch):
-    """Places lie at whole metres of the street's middle; each frame is as far from the nearest as it was registered."""
+    """Places are at whole metres of the street centre. Each frame has the distance of its pose to the nearest place."""
     monkeypatch.setattr(similar, "WIDTH_M", 0.01)
     found = refined(bundle, cloud, *two_frames).best
     stood = [found.T_map_camera @ frame.T_reference_camera for frame in two_frames]
@@ -370,7 +378,7 @@ def test_how_far_the_places_are_is_the_mean_over_frames(bundle, cloud, two_frame
 
 @pytest.fixture
 def asked(monkeypatch):
-    """What was given to each function of the end, in its order."""
+    """Record the arguments of each function of the last stage, in order."""
     calls = []
 
     def noted(name):
@@ -390,18 +398,20 @@ def asked(monkeypatch):
 def test_the_best_supported_candidate_is_adjusted_and_its_covariance_is_that_of_its_rays(
     bundle, cloud, depth, both, seen_in, asked
 ):
-    """Which is not the one that most points agree with, since the views of the other street are more similar."""
+    """It is not the candidate with most inliers, because the views of the other street are more similar."""
     first = seen_in(depth, both)
     frames = [replace(first, noise=noise) for noise in (3e-4, 1e-4, 2e-4)]
     found = refined(bundle, cloud, *frames, inliers=1.0, similarity=1.0, likelihood=0.0)
     best = found.best.registered
     assert best.inliers < max(each.registered.inliers for each in found.candidates)
-    (adjusting, (sights, pictures, before, settings)), (covering, (information, scatter, noise, heading, model)) = asked
+    (adjusting, (raycaster, pictures, before, settings)), (covering, (information, scatter, noise, heading, model)) = (
+        asked
+    )
     assert (adjusting, covering) == ("adjust", "covariance_of")
-    assert sights.cloud is cloud
+    assert raycaster.cloud is cloud
     assert settings == RefineSettings().rays
     assert [picture.noise for picture in pictures] == [3e-4, 1e-4, 2e-4]
-    again = adjust(sights, pictures, before, settings)
+    again = adjust(raycaster, pictures, before, settings)
     assert again is not None
     adjusted, its_scatter = again
     np.testing.assert_array_equal(best.camera_m, adjusted.camera_m)
@@ -415,7 +425,7 @@ def test_the_best_supported_candidate_is_adjusted_and_its_covariance_is_that_of_
     np.testing.assert_array_equal(found.covariance, covariance_of(information, scatter, noise, heading, OF_RAYS))
 
 
-def test_where_rays_meet_too_little_the_pose_and_its_covariance_are_those_of_the_points(
+def test_with_too_few_intersections_pose_and_covariance_are_those_of_the_points(
     bundle, cloud, depth, here, seen_in, asked
 ):
     settings = RefineSettings(rays=RaySettings(fewest=10**6))
@@ -432,7 +442,7 @@ def test_where_rays_meet_too_little_the_pose_and_its_covariance_are_those_of_the
 
 
 def test_frames_of_a_drive_are_adjusted_together(bundle, cloud, two_frames, asked):
-    """Each where odometry says its camera stood against the reference's level frame."""
+    """The odometry gives the camera pose of each frame relative to the level frame of the reference."""
     refined(bundle, cloud, *two_frames)
     _, pictures, _, _ = asked[0][1]
     for frame, picture in zip(two_frames, pictures, strict=True):
@@ -442,7 +452,7 @@ def test_frames_of_a_drive_are_adjusted_together(bundle, cloud, two_frames, aske
 
 
 def test_a_stereo_rigs_disparity_offset_is_estimated_where_its_baseline_is_known(bundle, cloud, street, here, seen_in):
-    """50 px times 1 m: 5 px of disparity at 10 m, of which 0.3 px are missing, so that all seems 6 % further away there."""
+    """50 px times 1 m give 5 px of disparity at 10 m. Of these 0.3 px are missing, so all depths are 6 % too large."""
     true = street.depth(CAMERA, TRUE)
     measured = (1 / (1 / np.maximum(true, 1e-3) - 0.3 / 50.0)).astype(np.float32)
     frame = seen_in(measured, here)
@@ -469,8 +479,8 @@ def test_the_unit_of_disparity_is_that_of_the_depth_picture(here, seen_in, width
     assert replace(query, depth_m=depth_m, baseline_m=0.5).focal_baseline_px_m == 0.5 * focal_px
 
 
-def test_starts_of_several_frames_are_asked_where_each_frame_stood(bundle_at, frame_with, matches_at, monkeypatch):
-    """Place k, at x = 10 k, is 0.1 k similar; the second frame stood 10 m ahead: the mean of places k and k + 1."""
+def test_starts_of_several_frames_are_scored_at_the_pose_of_each_frame(bundle_at, frame_with, matches_at, monkeypatch):
+    """Place k at x = 10 k has the similarity 0.1 k. The second frame is 10 m ahead, so the mean of k and k + 1 counts."""
     monkeypatch.setattr(similar, "PLACES", 1)
     bundle = bundle_at(
         [(10.0 * k, 0.0, 2.0) for k in range(8)], [0.0], [(0.1 * k, np.sqrt(1 - 0.01 * k * k)) for k in range(8)]

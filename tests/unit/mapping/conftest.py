@@ -1,4 +1,4 @@
-"""A drive in two halves, their maps, and the map of both built at once."""
+"""A drive in two halves, their maps, and the map of the whole drive."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -22,7 +22,7 @@ SETTINGS = BuildSettings(
 
 
 class Part(Dataset):
-    """Some scans of a dataset, as a dataset; ``demolished`` tells which points (n, 3; map frame) are no longer there."""
+    """Some scans of a dataset. ``demolished`` selects the points (n, 3; map frame) that no longer exist."""
 
     def __init__(self, folder: Path, numbers: list[int], demolished: Callable[[Any], Any] | None = None) -> None:
         super().__init__(folder)

@@ -13,7 +13,7 @@ POINTS_MAP = np.array([[4.0, 3.0, 2.0], [8.0, 3.0, 2.5], [6.0, -1.0, 0.0]])
 
 
 def placed(x_m, *, yaw_rad=0.0, height_m=1.7, intensity=10.0):
-    """A scan of ``POINTS_MAP`` from a pose on the x axis."""
+    """Return a scan of ``POINTS_MAP`` from a pose on the x axis."""
     T_map_level = transform_from(rotation_z(yaw_rad), np.array([x_m, 0.0, height_m]))
     points = np.c_[transform_points(inverse(T_map_level), POINTS_MAP), np.full(3, intensity)].astype(np.float32)
     level = Level(np.eye(3), height_m)

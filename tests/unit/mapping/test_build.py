@@ -4,7 +4,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from model_training.datasets.dataset import Dataset
+from model_training.datasets.dataset import Dataset, SurveyAccuracy
 from model_training.mapping import build, site_check, work
 from model_training.mapping.build import build_map, describe
 from model_training.mapping.settings import BuildSettings
@@ -53,7 +53,7 @@ def bundle(small_map):
     ],
 )
 def test_places_stand_the_spacing_apart_along_the_way(steps_m, spacing_m, kept):
-    """Less a tenth, so that noisy poses do not double the spacing."""
+    """The least spacing is a tenth smaller, so that noisy poses do not double the spacing."""
     assert thinned(track(steps_m), spacing_m).tolist() == kept
 
 
@@ -78,7 +78,7 @@ def test_places_lie_where_the_survey_drove(small_dataset, bundle):
 
 
 def test_places_know_their_street(bundle):
-    """The first place stands on the very edge of its street: its pose's error may put it outside."""
+    """The first place is on the edge of its street. Its pose error may move it outside."""
     assert set(bundle.place_street[1:].tolist()) == {0}
 
 
@@ -122,7 +122,7 @@ def test_weather_removal_is_recorded(small_dataset, encoder_file, tmp_path):
     )
 
 
-def test_progress_is_told_for_every_place(small_dataset, encoder_file, bundle, tmp_path):
+def test_progress_is_reported_for_every_place(small_dataset, encoder_file, bundle, tmp_path):
     told = []
     build_map(
         small_dataset,
@@ -134,14 +134,16 @@ def test_progress_is_told_for_every_place(small_dataset, encoder_file, bundle, t
     )
     count = bundle.manifest.counts.places
     assert told == [
-        *(("places", k, count) for k in range(1, count + 1)), ("places", count, count),
-        *(("traffic", k, count) for k in range(1, count + 1)), ("traffic", count, count),
+        *(("places", k, count) for k in range(1, count + 1)),
+        ("places", count, count),
+        *(("traffic", k, count) for k in range(1, count + 1)),
+        ("traffic", count, count),
         *(("writing", k, 2) for k in range(3)),
-    ]  # fmt: skip
+    ]
 
 
 def test_pictures_of_another_drive_are_answered(small_dataset, bundle):
-    """An untrained encoder: that there is an answer, not that it is right."""
+    """The encoder is untrained, so we check that there is an answer, not that it is right."""
     localizer = Localizer.open(bundle)
     for frame in small_dataset.queries("drive1_precise"):
         answer = localizer.localize(Query(rgb=frame.rgb(), depth_m=frame.depth_m(), camera=frame.camera.pinhole()))
@@ -201,7 +203,7 @@ def test_a_file_that_is_no_encoder_is_refused(small_dataset, tmp_path):
 
 @pytest.fixture
 def calibration_file(calibration_file_of, encoder_file):
-    """Even odds whatever the evidence, measured on the answers of this encoder."""
+    """Return a calibration that gives 0.5 for all features, measured with this encoder."""
     return calibration_file_of(Encoder.open(encoder_file).sha256)
 
 
@@ -230,7 +232,7 @@ def test_a_calibration_of_its_encoder_goes_into_the_map_unchecked_where_places_a
 def test_some_scans_are_held_out_to_check_it_and_are_in_the_map_all_the_same(
     small_dataset, encoder_file, bundle, calibration_file, tmp_path, monkeypatch
 ):
-    """Every fourth place. The untrained encoder's answers are wrong, so even odds are too high, and are lowered."""
+    """Every fourth place is held out. The untrained encoder answers wrongly, so 0.5 is too high and is lowered."""
     monkeypatch.setattr(site_check, "_EACH", 4)
     monkeypatch.setattr(site_check, "FEWEST", 2)
     settings, told = replace(SETTINGS, calibration=calibration_file), []
@@ -330,7 +332,7 @@ def test_a_map_is_described_in_one_line(bundle):
 
 
 def test_a_survey_with_poses_of_two_frames_is_refused_before_the_work(small_dataset, encoder_file, tmp_path):
-    """One pose in UTM among local ones: its voxels would have had the keys of others."""
+    """One pose is in UTM, the others are local. Its voxels would have had the keys of others."""
 
     class OneInUtm(Dataset):
         def survey_poses(self):
@@ -351,10 +353,34 @@ def test_a_survey_with_poses_of_two_frames_is_refused_before_the_work(small_data
     assert not (tmp_path / "m").exists()
 
 
-def test_traffic_is_voted_about_unless_told_otherwise(small_dataset, encoder_file, bundle, tmp_path):
+def test_the_traffic_vote_is_on_by_default(small_dataset, encoder_file, bundle, tmp_path):
     assert BuildSettings(name="any").traffic_vote
     assert "traffic_vote" not in bundle.manifest.parameters
     settings = replace(SETTINGS, traffic_vote=True)
     made = build_map(small_dataset, encoder_file, tmp_path / "without traffic", settings, threads=1)
     assert made.parameters["traffic_vote"] == 1.0
     assert made.counts.cloud_points <= bundle.manifest.counts.cloud_points
+
+
+STATED = SurveyAccuracy(position_std_m=0.08, angle_std_deg=0.1)
+
+
+@pytest.mark.parametrize(
+    ("options", "stated", "expected"),
+    [
+        ({}, None, {}),
+        ({}, STATED, {"survey_position_std_m": 0.08, "survey_angle_std_deg": 0.1}),
+        ({"survey_std_m": 0.0}, STATED, {"survey_position_std_m": 0.0, "survey_angle_std_deg": 0.1}),
+        ({"survey_std_deg": 0.2}, None, {"survey_angle_std_deg": 0.2}),
+    ],
+)
+def test_a_given_accuracy_of_the_survey_comes_before_the_stated_one(options, stated, expected):
+    assert BuildSettings(name="any", **options).survey_accuracy(stated) == expected
+
+
+@pytest.mark.parametrize("field", ["survey_std_m", "survey_std_deg"])
+@pytest.mark.parametrize("value", [-0.1, 5.1, float("nan")])
+def test_an_accuracy_out_of_bounds_is_refused(field, value):
+    with pytest.raises(DatasetError, match=rf"^{field}: .* is not valid; give 0 to 5$") as error:
+        BuildSettings(name="any", **{field: value})
+    assert error.value.field == field

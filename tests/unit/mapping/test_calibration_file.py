@@ -18,7 +18,7 @@ def test_that_of_another_encoder_is_none(calibration_file_of):
     assert calibration_for(calibration_file_of(OTHER), OWN) is None
 
 
-def test_none_is_asked_for_and_none_is_taken():
+def test_without_a_calibration_file_there_is_no_calibration():
     assert calibration_for(None, OWN) is None
 
 

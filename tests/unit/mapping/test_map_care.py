@@ -1,4 +1,4 @@
-"""``info``, ``verify`` and ``diff``, and all of ``streetfix map`` as a person calls it."""
+"""``info``, ``verify`` and ``diff``, and ``streetfix map`` as a user calls it."""
 
 import json
 import re
@@ -27,7 +27,7 @@ SKEWED = np.pad(np.full((3, 3), 1.0001), (0, 1), constant_values=1.0)
 
 @pytest.fixture
 def run(monkeypatch, capsys):
-    """``streetfix map``, installed or not: code, stdout, stderr."""
+    """Run ``streetfix map``; return code, stdout and stderr."""
     point = EntryPoint("map", "model_training.cli.map_care:app", command_line.GROUP)
     monkeypatch.setattr(command_line, "entry_points", lambda **_: [point])
 
@@ -59,7 +59,7 @@ def test_info_tells_what_the_bundle_holds(small_map):
     json.dumps(found)
 
 
-def test_info_as_a_person_asks_it(run, small_map):
+def test_info_for_a_user(run, small_map):
     code, out, _ = run("info", small_map)
     assert code == 0
     assert out.startswith("map small, version ")
@@ -96,7 +96,7 @@ def test_every_damaged_file_is_named(run, own):
     ]
 
 
-def test_what_is_no_bundle_is_one_defect(run, tmp_path):
+def test_a_folder_that_is_no_bundle_is_one_defect(run, tmp_path):
     code, out, _ = run("verify", tmp_path)
     assert code == 1
     assert "not a map bundle: manifest.json is missing" in out
@@ -113,12 +113,14 @@ def test_a_manifest_of_another_format_is_named(own):
     [
         (lambda c: {"descriptors": 2 * c.descriptors}, r"views\.faiss: \d+ descriptors are not unit vectors"),
         (lambda c: {"T_map_place": c.T_map_place * SKEWED}, r"places\.npy: 12 poses are not rigid transforms"),
-        (lambda _: {"place_street": np.array([2] * 6 + [1, 1, 2, 2, 2, 2], np.int32)},
-         r"places\.npy: 6 places are outside the streets that they name"),
+        (
+            lambda _: {"place_street": np.array([2] * 6 + [1, 1, 2, 2, 2, 2], np.int32)},
+            r"places\.npy: 6 places are outside the streets that they name",
+        ),
         (lambda _: {"statistics": np.zeros(3)}, r"voxels\.npy: unexpected type float64"),
     ],
-)  # fmt: skip
-def test_contents_that_contradict_each_other_are_told(content, tmp_path, change, message):
+)
+def test_contradicting_contents_are_reported(content, tmp_path, change, message):
     write_bundle(tmp_path / "m", replace(content, **change(content)))
     assert re.search(message, "\n".join(damage_of(tmp_path / "m")))
 
@@ -138,7 +140,7 @@ def test_a_map_does_not_differ_from_itself(run, small_map):
 
 
 def slab(corner, *, count=4):
-    """Points of ``count`` x ``count`` voxels of 0.3 m on the ground, nine in each."""
+    """Return points of ``count`` x ``count`` ground voxels of 0.3 m, nine in each."""
     steps = np.arange(count * 3) * 0.1 + 0.05
     x, y = np.meshgrid(steps, steps)
     return np.c_[x.ravel(), y.ravel(), np.full(x.size, 0.05)] + [*corner, 0.0]
@@ -156,7 +158,7 @@ def map_with(tmp_path, name, content, slabs, **changed):
 
 @pytest.fixture
 def changed(content, tmp_path):
-    """Before: slabs at (0, 0) and (30, 0). After: at (0, 0) and (90, 0); a place moved by 1 m, two more gone, a street renamed."""
+    """Old: slabs at (0, 0) and (30, 0). New: at (0, 0) and (90, 0); one place moved by 1 m, two removed, a street renamed."""
     before = map_with(tmp_path, "before", content, [(0.0, 0.0), (30.0, 0.0)])
     moved = content.T_map_place[2:].copy()
     moved[0, 0, 3] += 1.0
@@ -164,10 +166,18 @@ def changed(content, tmp_path):
     streets["features"][0]["properties"]["name"] = "Another name"
     streets["features"][1]["properties"]["id"] = "new"
     after = map_with(
-        tmp_path, "after", content, [(0.0, 0.0), (90.0, 0.0)], T_map_place=moved, place_street=content.place_street[2:],
-        view_place=content.view_place[:-8], view_heading_rad=content.view_heading_rad[8:], descriptors=content.descriptors[8:],
-        streets=streets, parameters={"survey_scans": 7.0},
-    )  # fmt: skip
+        tmp_path,
+        "after",
+        content,
+        [(0.0, 0.0), (90.0, 0.0)],
+        T_map_place=moved,
+        place_street=content.place_street[2:],
+        view_place=content.view_place[:-8],
+        view_heading_rad=content.view_heading_rad[8:],
+        descriptors=content.descriptors[8:],
+        streets=streets,
+        parameters={"survey_scans": 7.0},
+    )
     return before, after
 
 
@@ -176,8 +186,9 @@ def test_differences_by_hand(changed):
     assert found["places"] == {"kept": 10, "moved": 1, "largest_move_m": 1.0, "added": [], "removed": [0, 1]}
     assert (found["cloud"]["appeared"], found["cloud"]["vanished"], found["cloud"]["kept"]) == (16, 16, 16)
     assert found["cloud"]["areas"] == [
-        {"x": 30.0, "y": 10.0, "appeared": 0, "vanished": 16}, {"x": 90.0, "y": 10.0, "appeared": 16, "vanished": 0}
-    ]  # fmt: skip
+        {"x": 30.0, "y": 10.0, "appeared": 0, "vanished": 16},
+        {"x": 90.0, "y": 10.0, "appeared": 16, "vanished": 0},
+    ]
     assert found["streets"] == {"added": ["new"], "removed": ["s1"], "changed": ["s0"]}
     assert found["parameters"] == {"survey_scans": [None, 7.0]}
     json.dumps(found)
@@ -200,7 +211,7 @@ def test_the_picture_shows_green_and_red(run, changed, tmp_path):
     assert "cannot be written" in err
 
 
-def test_another_encoder_is_told(changed, content, encoder_of, tmp_path):
+def test_another_encoder_is_reported(changed, content, encoder_of, tmp_path):
     other = map_with(tmp_path, "other", content, [(0.0, 0.0)], encoder=encoder_of(seed=9))
     assert diff_of(changed[0], other)["encoder_changed"] is True
 
@@ -236,7 +247,7 @@ def test_content_survives_the_disk(content, bundle_path):
     assert (found.streets, found.encoder, found.parameters) == (content.streets, content.encoder, content.parameters)
 
 
-def test_a_map_that_does_not_say_its_voxels_is_refused(content, tmp_path):
+def test_a_map_without_a_voxel_size_is_refused(content, tmp_path):
     from model_training.mapping.stored_map import voxels_of
 
     write_bundle(tmp_path / "m", replace(content, parameters={"lidar_height_m": 1.8}))

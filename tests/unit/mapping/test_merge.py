@@ -44,7 +44,7 @@ def positions(bundle):
 
 
 def nearest_of(points, asked):
-    """Return distance and index of the nearest of ``points`` to each point asked for."""
+    """Return distance and index of the nearest of ``points`` to each query point."""
     return cKDTree(points).query(asked)
 
 
@@ -119,7 +119,7 @@ def test_merging_twice_gives_the_same_version(half_maps, merged, tmp_path):
 
 
 def test_bundles_without_sums_merge_by_their_surfels(half_maps, whole, tmp_path):
-    """Approximated: a surfel counts as a disc. Means of voxels are kept, thickness and normals nearly."""
+    """Approximation: a surfel counts as a disc. Voxel means are equal; thickness and normals are close."""
     old = []
     for number, path in enumerate(half_maps):
         bundle = MapBundle.open(path)
@@ -153,7 +153,7 @@ def content(half_maps):
         ("rows_seen", lambda c: {"rows_seen": ~c.rows_seen}),
     ],
 )
-def test_maps_that_do_not_fit_are_refused_and_told_in_what(content, what, change):
+def test_maps_that_do_not_fit_are_refused_with_the_reason(content, what, change):
     other = replace(content, **change(content))
     with pytest.raises(BundleError, match=f"^{what}: ") as refused:
         require_same(content, other, names=("maps/a", "maps/b"))
@@ -170,7 +170,7 @@ def test_another_encoder_is_refused_before_anything_is_written(half_maps, halves
     assert not (tmp_path / "m").exists()
 
 
-def test_what_is_no_bundle_is_refused(half_maps, tmp_path):
+def test_a_folder_that_is_no_bundle_is_refused(half_maps, tmp_path):
     with pytest.raises(BundleError, match=r"not a map bundle: manifest\.json is missing"):
         merge_maps(half_maps[0], tmp_path, tmp_path / "m")
 
@@ -204,7 +204,7 @@ def test_next_to_nothing_all_places_stay():
 
 
 def test_heights_are_averaged_over_the_places_by_hand(content):
-    """Five places at 1.8 m and five at 2.0 m far away: 1.9 m; those of the first rise by 0.1 m, of the second they sink."""
+    """Five places at 1.8 m and five at 2.0 m far away give 1.9 m. The first rise by 0.1 m, the second sink by 0.1 m."""
     first = replace(content, parameters={**content.parameters, "lidar_height_m": 1.8})
     moved = content.T_map_place.copy()
     moved[:, 0, 3] += 1000.0
@@ -243,10 +243,22 @@ def test_site_checks_add_up_and_the_lower_offset_holds():
     other = {"offset": -0.5, "queries": 60, "right": 50, "expected_calibration_error": 0.3}
     found = joined_calibration({**calibration, "site": SITE}, {**calibration, "site": other})
     assert found["site"] == {
-        "offset": -0.5, "queries": 80, "right": 68, "expected_calibration_error": pytest.approx(0.25)
-    }  # fmt: skip
+        "offset": -0.5,
+        "queries": 80,
+        "right": 68,
+        "expected_calibration_error": pytest.approx(0.25),
+    }
     assert joined_calibration({**calibration, "site": None}, {**calibration, "site": SITE})["site"] == SITE
     assert joined_calibration({**calibration, "site": None}, {**calibration, "site": None})["site"] is None
+
+
+def test_a_correction_for_a_rig_stays_only_if_both_maps_have_the_same():
+    one, other = ({"calibrated": True, "site": None, "rig": {"scale": scale}} for scale in (0.5, 0.6))
+    none = {"calibrated": True, "site": None, "rig": None}
+    assert joined_calibration(one, one)["rig"] == {"scale": 0.5}
+    assert joined_calibration(one, other)["rig"] is None
+    assert joined_calibration(one, none)["rig"] is None
+    assert joined_calibration(none, {"calibrated": True, "site": None})["rig"] is None
 
 
 def test_with_an_uncalibrated_map_the_whole_is_uncalibrated():
@@ -275,7 +287,7 @@ def test_the_manifest_is_of_the_same_format(merged):
 
 
 def test_brightness_of_a_merged_map_is_that_of_both_surveys(merged, whole):
-    """The mean over the returns of both, whichever survey they are of."""
+    """The mean counts the returns of both surveys."""
     distance, nearest = nearest_of(positions(whole), positions(merged))
     same = distance < 1e-4
     assert same.mean() > 0.95
@@ -293,3 +305,16 @@ def test_maps_too_far_apart_for_one_cloud_are_refused(half_maps, tmp_path):
     with pytest.raises(DatasetError, match=r"far: place \d+ is 200 km from the middle of the map"):
         merge_maps(half_maps[0], tmp_path / "far", tmp_path / "m")
     assert not (tmp_path / "m").exists()
+
+
+def test_a_joined_map_states_the_worse_accuracy_of_both_surveys(whole):
+    content = content_of(whole)
+    first = replace(content, parameters={**content.parameters, "survey_position_std_m": 0.02})
+    second = replace(
+        content,
+        T_map_place=content.T_map_place + np.array([[0, 0, 0, 1000.0], [0] * 4, [0] * 4, [0] * 4]),
+        parameters={**content.parameters, "survey_position_std_m": 0.08, "survey_angle_std_deg": 0.1},
+    )
+    require_same(first, second, names=("one", "other"))
+    found = joined(first, second).parameters
+    assert (found["survey_position_std_m"], found["survey_angle_std_deg"]) == (0.08, 0.1)

@@ -1,4 +1,4 @@
-"""What moved between passes: a street worked by hand, and a simulated one."""
+"""Dynamic objects between passes: a street computed by hand, and a simulated one."""
 
 from types import SimpleNamespace
 from typing import Any
@@ -21,17 +21,17 @@ WALL_Y = 8.0
 
 
 def along(x_m):
-    """A LiDAR at each x, 1.8 m above the ground."""
+    """Return a LiDAR pose at each x, 1.8 m above the ground."""
     return np.stack([transform_from(np.eye(3), np.array([x, 0.0, LIDAR_M])) for x in x_m])
 
 
 def drive(count):
-    """The same street of 60 m in the same direction so many times."""
+    """Return a drive that passes the same street of 60 m several times in one direction."""
     return np.concatenate([along(np.arange(0.0, 61.0, 4.0))] * count)
 
 
 def scan_of(T, *, car, van=None):
-    """64 beams, 720 directions, in the LiDAR's frame: ground, a wall at y = 8 m, a pole, a parked car and a van where they are."""
+    """Return 64 beams x 720 directions in the LiDAR frame: ground, a wall at y = 8 m, a pole, a parked car and a van."""
     azimuth, elevation = np.meshgrid(np.arange(720) / 720 * 2 * np.pi, np.deg2rad(np.linspace(-25, 10, 64)))
     flat = np.cos(elevation)
     ray = np.stack([flat * np.cos(azimuth), flat * np.sin(azimuth), np.sin(elevation)], axis=-1).reshape(-1, 3)
@@ -50,13 +50,13 @@ def scan_of(T, *, car, van=None):
 
 
 def moved(cloud, dataset, poses, folder, *, earlier=None, each_scan=False):
-    """Keys of the voxels that a vote of all scans removes, in chunks that are stored in a folder."""
+    """Return the keys of the voxels that a vote of all scans removes, with chunks stored in a folder."""
     vote = Vote.of(cloud, dataset, poses, np.arange(len(poses)), SETTINGS, each_scan=each_scan)
     return vote.removed(Work(folder, "k").chunks("votes", len(poses), vote.votes), earlier)
 
 
 def voted(tmp_path, *, cars, earlier=None):
-    """The street driven once for each flag of ``cars``; the cloud before and after the vote."""
+    """Drive the street once for each flag of ``cars``; return the cloud before and after the vote."""
     poses = drive(len(cars))
     each = len(poses) // len(cars)
     dataset: Any = SimpleNamespace(scan=lambda number: scan_of(poses[number], car=cars[number // each]))
@@ -114,8 +114,8 @@ def test_a_single_pass_decides_nothing(tmp_path):
     assert not voted(tmp_path, cars=[True])[1].any()
 
 
-def test_traffic_of_a_single_pass_vanishes_and_all_that_stands_stays(tmp_path):
-    """A van drives on 10 m ahead, in the lane to the right; the parked car is there in every scan."""
+def test_dynamic_objects_of_a_single_pass_are_removed_and_static_ones_stay(tmp_path):
+    """A van drives 10 m ahead in the right lane. The parked car is in every scan."""
     poses = along(np.arange(0.0, 41.0, 2.0))
     vans = [(np.array([x + 10.0, -4.0, 0.3]), np.array([x + 14.0, -2.0, 2.3])) for x in poses[:, 0, 3]]
     dataset: Any = SimpleNamespace(scan=lambda number: scan_of(poses[number], car=True, van=vans[number]))
@@ -139,8 +139,8 @@ def test_traffic_of_a_single_pass_vanishes_and_all_that_stands_stays(tmp_path):
     assert removed[stands].mean() < 0.002
 
 
-def test_two_new_passes_overrule_what_the_map_had(tmp_path_factory):
-    """The map's car, which neither of two new passes hits: the map counts as one pass. One new pass is not enough."""
+def test_two_new_passes_overrule_the_map(tmp_path_factory):
+    """The map has a car that neither of two new passes hits. The map counts as one pass, so one new pass is not enough."""
     rng = np.random.default_rng(0)
     sides = rng.uniform(BOX[0], BOX[1], (4000, 3))
     sides[:, 1] = BOX[0][1]  # the side that looks at the street
@@ -167,7 +167,7 @@ def test_the_votes_of_finished_scans_are_kept(tmp_path, monkeypatch):
 
 
 def test_passes_count_up_where_a_tile_comes_into_reach_again():
-    """Out to 200 m and back, every 2 m: near the start two passes, at the turn one; and at a first visit always number 0."""
+    """The drive goes out to 200 m and back, every 2 m: two passes near the start, one at the turn. First visits have number 0."""
     x = np.r_[np.arange(0.0, 201.0, 2.0), np.arange(198.0, -1.0, -2.0)]
     found = Passes.of(along(x))
     at = {place: tile_of(np.array([[place, 0.0, 0.0]]))[0] for place in (5.0, 195.0)}

@@ -39,21 +39,21 @@ odds = st.lists(st.floats(-20, 20), min_size=1, max_size=40).map(np.array)
 
 
 def test_the_offset_by_hand():
-    """One answer at even odds that was wrong: p(x) + x = 0 under a prior of one, at -0.401; right, the same upwards."""
+    """One wrong answer at 0.5: p(x) + x = 0 with a unit prior, so x = -0.401. For a right answer, x has the opposite sign."""
     wrong = site_check._offset(np.zeros(1), np.array([False]))
     assert wrong == pytest.approx(-0.40105, abs=1e-4)
     assert probability(np.array([wrong]))[0] + wrong == pytest.approx(0, abs=1e-9)
     assert site_check._offset(np.zeros(1), np.array([True])) == pytest.approx(-wrong)
 
 
-def test_where_as_many_are_right_as_was_said_there_is_no_offset():
-    """Three of four at log 3, three quarters; and one of two at even odds."""
+def test_a_calibrated_share_gives_no_offset():
+    """Three of four are right at log 3 (0.75), and one of two at 0."""
     assert site_check._offset(np.full(4, np.log(3)), np.array([1, 1, 1, 0], bool)) == pytest.approx(0, abs=1e-9)
     assert site_check._offset(np.zeros(2), np.array([1, 0], bool)) == pytest.approx(0, abs=1e-9)
 
 
 def test_many_answers_overrule_the_prior():
-    """Nine in ten was said, one in two was right: log 9 too much."""
+    """0.9 was stated and 0.5 is right: the log odds are too large by log 9."""
     count = 20_000
     found = site_check._offset(np.full(count, np.log(9)), np.arange(count) % 2 == 0)
     assert found == pytest.approx(-np.log(9), abs=0.002)
@@ -67,7 +67,7 @@ def test_the_offset_is_where_errors_and_prior_balance(odds_of, bits):
 
 
 def test_a_map_to_check_has_neither_calibration_nor_brightness_nor_preview(content):
-    """The images are rendered from the same sensor's intensities. They would agree with the map as no camera's do."""
+    """The check images are rendered from the intensities of the same sensor. They agree with the map better than real images."""
     cloud = SurfelMap.prepare(np.zeros(3), np.zeros(4, SURFEL), np.zeros((0, 4)), np.ones(4, np.float32))
     given = replace(content, cloud=cloud, preview_webp=b"x", calibration={"calibrated": True})
     found = site_check._to_check(given)
@@ -81,7 +81,7 @@ def test_a_map_to_check_has_neither_calibration_nor_brightness_nor_preview(conte
 
 
 def sphere(radius_m, *, intensity=40.0):
-    """One point in the middle of every cell of the grid, all round."""
+    """Return a scan with one point in the middle of every cell of the grid, all around."""
     azimuth, elevation = np.meshgrid(np.arange(GRID.around) / GRID.around * 2 * np.pi - np.pi, GRID.elevations_rad)
     flat = np.cos(elevation)
     directions = np.stack([flat * np.cos(azimuth), flat * np.sin(azimuth), np.sin(elevation)], axis=-1).reshape(-1, 3)
@@ -111,7 +111,7 @@ def test_a_picture_drawn_inside_a_sphere_sees_its_radius_along_every_ray(noisele
 
 
 def test_a_picture_sees_what_the_scan_measured_where_it_looks(noiseless):
-    """Ranges that differ all round: each pixel's is that of the panorama's cell that its ray meets."""
+    """All ranges differ. Each pixel has the range of the panorama cell that its ray intersects."""
     points = sphere(1.0)
     azimuth = np.arctan2(points[:, 1], points[:, 0])
     points[:, :3] *= (8.0 + 4.0 * np.sin(2 * azimuth))[:, None]
@@ -125,7 +125,7 @@ def test_a_picture_sees_what_the_scan_measured_where_it_looks(noiseless):
     assert np.mean((found - expected)[seen]) == pytest.approx(0, abs=0.002)
 
 
-def test_the_pose_is_the_scans_in_the_map_and_gravity_is_told():
+def test_the_pose_is_that_of_the_scan_in_the_map_and_gravity_is_written():
     T_map_level = transform_from(rotation_z(1.0), np.array([100.0, -50.0, 3.0]))
     query, T_map_camera = drawn(sphere(10.0), 3, T_map_level)
     np.testing.assert_allclose(T_map_camera[:3, 3], [100, -50, 3])
@@ -142,7 +142,7 @@ def test_headings_differ_from_scan_to_scan_and_are_the_same_the_next_time():
 
 @pytest.mark.parametrize(("number", "noise_px"), [(0, 0.1), (1, 0.5)])
 def test_the_noise_is_that_of_the_presets_by_turns(number, noise_px):
-    """Inverse depth errs by noise / 80 px m, on a sphere of 5 m; half of the variance is shared by a cell's pixels."""
+    """The inverse depth error is noise / 80 px m, on a sphere of 5 m. Pixels of a cell share half of the variance."""
     depth_m = drawn(sphere(5.0), number)[0].depth_m
     seen = depth_m > 0
     error = 1 / depth_m[seen] - np.linalg.norm(site_check._CAMERA.rays_of_pixels(), axis=-1)[seen] / 5.0
@@ -168,8 +168,8 @@ def test_grey_follows_the_intensity_and_its_median_is_110(noiseless):
 
 
 @pytest.mark.parametrize(("radius_m", "is_drawn"), [(39.9, True), (40.1, False), (90.0, False)])
-def test_what_the_views_of_the_map_forget_is_not_drawn_either(noiseless, radius_m, is_drawn):
-    """Beyond 40 m."""
+def test_ranges_that_map_views_discard_are_not_rendered(noiseless, radius_m, is_drawn):
+    """The views discard ranges beyond 40 m."""
     query, _ = drawn(sphere(radius_m), 0)
     assert (query.depth_m > 0).any() == is_drawn
     assert query.rgb.any() == is_drawn
@@ -177,7 +177,7 @@ def test_what_the_views_of_the_map_forget_is_not_drawn_either(noiseless, radius_
 
 @pytest.fixture(scope="module")
 def scan_of_pictures(pictures):
-    """What a LiDAR in the camera's place would have measured of ``pictures``, its place in the map."""
+    """Return the scan that a LiDAR at the camera would measure of ``pictures``, at its map pose."""
     _, depth_m, camera = pictures
     points = (camera.rays_of_pixels() * depth_m[..., None]).reshape(-1, 3) @ R_BODY_OPTICAL.T
     scan = np.c_[points, np.full(len(points), 30.0)].astype(np.float32)
@@ -185,7 +185,7 @@ def scan_of_pictures(pictures):
 
 
 def asked(content, calibration, scan, *, right, bias, count=30, monkeypatch):
-    """The check with odds of one's own: each query is answered in its place, or 5 m beside it."""
+    """Run the check with given odds: each query is answered at its place, or 5 m beside it."""
     number = iter(range(count))
 
     class Answering:
@@ -206,7 +206,7 @@ def asked(content, calibration, scan, *, right, bias, count=30, monkeypatch):
 
 @pytest.fixture
 def calibrated_at(calibration_of, calibration_json):
-    """Whatever the evidence, the same odds of being right."""
+    """Return a calibration with the same odds of a right pose for all features."""
     return lambda *, right: calibration_of(right=calibration_json()["right"] | {"bias": float(right)})
 
 
@@ -214,7 +214,7 @@ def calibrated_at(calibration_of, calibration_json):
 def test_confidence_that_was_too_low_is_left_as_it_is(
     content, calibrated_at, scan_of_pictures, monkeypatch, right, said
 ):
-    """All of these queries are in the map: they cannot show that an answer deserves more belief."""
+    """All of these queries are in the map. So they cannot show that answers deserve a higher confidence."""
     found = asked(
         content, calibrated_at, scan_of_pictures, right=right, bias=np.log(said / (1 - said)), monkeypatch=monkeypatch
     )
@@ -223,7 +223,7 @@ def test_confidence_that_was_too_low_is_left_as_it_is(
 
 
 def test_confidence_that_was_too_high_is_lowered(content, calibrated_at, scan_of_pictures, monkeypatch):
-    """Nine in ten was said, half was right."""
+    """0.9 was stated, 0.5 was right."""
     found = asked(content, calibrated_at, scan_of_pictures, right=15, bias=np.log(9), monkeypatch=monkeypatch)
     assert -np.log(9) < found.offset < -1.0
     assert found.right == 15
@@ -232,8 +232,8 @@ def test_confidence_that_was_too_high_is_lowered(content, calibrated_at, scan_of
     assert lowered < 0.75
 
 
-def test_a_real_map_is_asked_without_what_was_held_out(content, calibrated_at, scan_of_pictures):
-    """The tiny map, its true place held out: what is asked is the rest, where the pictures resemble nothing."""
+def test_a_real_map_is_searched_without_the_held_out_places(content, calibrated_at, scan_of_pictures):
+    """The tiny map without its true place: the check uses only the other places, which do not resemble the images."""
     told = []
     calibration = calibrated_at(right=np.log(3))
     rest = of_places(content, np.arange(len(content.T_map_place)) != 8)

@@ -69,7 +69,7 @@ def test_the_same_drive_again_adds_no_place(small_map, small_dataset, tmp_path):
 
 @pytest.fixture(scope="module")
 def block(whole):
-    """What is demolished: all that stands higher than 1 m above the ground in the middle 15 m of the street."""
+    """Return points of the demolished block: everything higher than 1 m in the middle 15 m of the street."""
     track = whole.T_map_place[:, :3, 3]
     along = int(np.ptp(track[:, 1]) > np.ptp(track[:, 0]))
     middle = float(track[:, along].mean())
@@ -94,7 +94,7 @@ def near_track(bundle, points, reach_m=8.0):
     return cKDTree(bundle.T_map_place[:, :2, 3]).query(points[:, :2])[0] < reach_m
 
 
-def test_what_was_demolished_stays_unless_it_is_replaced(rebuilt, whole, block):
+def test_a_demolished_block_stays_without_replacement(rebuilt, whole, block):
     before = positions(whole)
     standing = int((block(before) & near_track(whole, before)).sum())
     left = [int((block(positions(b)) & near_track(b, positions(b))).sum()) for b in rebuilt]
@@ -113,7 +113,7 @@ def test_replaced_places_are_those_of_the_new_drive(rebuilt, whole):
 
 
 def test_elsewhere_the_map_stays_as_it_was(rebuilt, whole, block):
-    """Only what the new drive covers is replaced, and it measured all that stands apart from the block."""
+    """The update replaces only the part that the new survey covers. That survey measured everything except the block."""
     before = positions(whole)
     others = before[~block(before)]
     assert np.mean(cKDTree(positions(rebuilt[1])).query(others)[0] < 0.3) > 0.97
@@ -145,7 +145,7 @@ def test_a_polygon_is_replaced_and_nothing_else(small_map, whole, small_dataset,
 
 def test_a_polygon_far_from_the_drive_is_refused(small_map, small_dataset, tmp_path):
     area = square(tmp_path / "far.geojson", np.array([9000.0, 9000.0]), np.array([9100.0, 9100.0]))
-    with pytest.raises(DatasetError, match="none of the new drive's places lies in the polygon"):
+    with pytest.raises(DatasetError, match="no place of the new survey lies in the polygon"):
         update_map(small_map, small_dataset, tmp_path / "m", replace_area=area, threads=1)
     assert not (tmp_path / "m").exists()
 
@@ -161,7 +161,7 @@ def test_a_polygon_far_from_the_drive_is_refused(small_map, small_dataset, tmp_p
         ('{"type": "Polygon", "coordinates": [[[0, 0], [1]]]}', "not a valid geometry"),
     ],
 )
-def test_what_is_no_polygon_is_refused(tmp_path, text, message):
+def test_an_invalid_polygon_is_refused(tmp_path, text, message):
     (tmp_path / "area.geojson").write_text(text)
     with pytest.raises(DatasetError, match=message):
         polygon_of(tmp_path / "area.geojson")
@@ -182,7 +182,7 @@ def test_polygons_come_alone_or_as_features(tmp_path):
 
 
 def test_covered_is_where_something_was_measured_near_the_track():
-    """A row of points beside a place: its cells and a gap of one cell, not what lies beyond 25 m or where nothing was measured."""
+    """Covered are the cells of measured points beside a place, and gaps of one cell. Beyond 25 m nothing is covered."""
     x = np.array([11.0, 13.0, 17.0, 41.0])
     inside = covered_by(np.c_[x, np.full(4, 9.0)], np.array([[0.0, 1.0]]))
     asked = np.array([[11.5, 9.5], [15.0, 9.0], [17.0, 9.0], [41.0, 9.0], [11.0, 30.0], [-900.0, 9.0], [3.0, 1.0]])
@@ -196,7 +196,7 @@ def test_a_drive_in_another_frame_is_refused(small_map, small_dataset, tmp_path)
     description["georeference"] = {"latitude_deg": 52.5, "longitude_deg": 13.4, "height_m": 30.0}
     (folder / "dataset.json").write_text(json.dumps(description))
     with pytest.raises(
-        DatasetError, match=r"its frame lies at .*52\.5.* that of the map .* at no known place"
+        DatasetError, match=r"the georeference of the dataset is .*52\.5.* that of the map .* is missing"
     ) as refused:
         update_map(small_map, Dataset(folder), tmp_path / "m", threads=1)
     assert refused.value.field == "georeference"
@@ -211,7 +211,7 @@ def test_a_lidar_that_sees_other_rows_is_refused(small_map, small_dataset, part_
     ground = float(whole.T_map_place[:, 2, 3].mean()) - whole.manifest.lidar_height_m
     low = part_of(range(len(small_dataset.survey_poses())), lambda points: points[:, 2] > ground + 0.5)
     far = part_of(low.numbers, lambda p: low.demolished(p) | (np.linalg.norm(p - p.mean(axis=0), axis=1) > 8))
-    with pytest.raises(DatasetError, match="its LiDAR does not see"):
+    with pytest.raises(DatasetError, match="the LiDAR of the survey does not see"):
         update_map(small_map, far, tmp_path / "m", threads=1)
 
 
@@ -220,7 +220,7 @@ def test_a_name_that_is_taken_is_refused(small_map, small_dataset, tmp_path):
         update_map(small_map, small_dataset, tmp_path, threads=1)
 
 
-def test_what_is_no_bundle_is_refused(small_dataset, tmp_path):
+def test_a_folder_that_is_no_bundle_is_refused(small_dataset, tmp_path):
     with pytest.raises(BundleError, match=r"not a map bundle: manifest\.json is missing"):
         update_map(tmp_path, small_dataset, tmp_path / "m", threads=1)
 
@@ -232,9 +232,7 @@ def test_a_street_that_contradicts_the_maps_is_refused_before_the_work(small_map
     (folder / "streets.geojson").write_text(json.dumps(streets))
     told = []
     with pytest.raises(BundleError, match="both maps have a street"):
-        update_map(
-            small_map, Dataset(folder), tmp_path / "m", threads=1, report=lambda *event: told.append(event)
-        )  # fmt: skip
+        update_map(small_map, Dataset(folder), tmp_path / "m", threads=1, report=lambda *event: told.append(event))
     assert told == []
 
 
@@ -250,9 +248,7 @@ def test_a_killed_update_goes_on_to_the_same_version(half_maps, halves, extended
     assert not (tmp_path / "m").exists()
     assert list(work_folder(tmp_path / "m").glob("places-*"))
     made = update_map(half_maps[0], halves[1], tmp_path / "m", threads=1)
-    np.testing.assert_allclose(
-        positions(MapBundle.open(tmp_path / "m")), positions(extended), atol=1e-4
-    )  # fmt: skip
+    np.testing.assert_allclose(positions(MapBundle.open(tmp_path / "m")), positions(extended), atol=1e-4)
     assert made.counts == extended.manifest.counts
     assert not work_folder(tmp_path / "m").exists()
 
@@ -275,8 +271,8 @@ def test_a_drive_too_far_from_the_map_is_refused(half_maps, halves, tmp_path, mo
         update_map(half_maps[0], halves[1], tmp_path / "m", threads=1)
 
 
-def test_a_drive_is_cleared_of_traffic_if_the_maps_was(halves, map_of, tmp_path, monkeypatch):
-    """And where the map was built without, the update is, too; what is said of the map holds of all of its drives."""
+def test_an_update_removes_dynamic_objects_if_the_map_did(halves, map_of, tmp_path, monkeypatch):
+    """A map that was built without the vote gets an update without it. The manifest holds for all surveys of the map."""
     asked = []
     real = ResumedStages.dynamic_voxels
 

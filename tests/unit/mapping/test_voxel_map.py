@@ -19,7 +19,7 @@ def map_of(*clouds, voxel_m=0.5, origin=(100.0, -50.0, 2.0)):
 
 
 def slow_surfels(points, *, voxel_m=0.5, origin=(100.0, -50.0, 2.0), fewest=5):
-    """Voxel by voxel: mean of its points; normal and thickness of those in it and, weighted by how it lies, in its 26 neighbours."""
+    """Compute voxel by voxel: the mean of its points, and normal and thickness from the 26 neighbours, weighted by position."""
     cells = np.floor((points - np.array(origin)) / voxel_m).astype(int)
     rows = []
     for cell in np.unique(cells, axis=0):
@@ -70,7 +70,7 @@ def test_the_normal_of_a_plane_is_square_to_it():
 
 
 def test_a_corner_is_not_rounded_off():
-    """Two walls that meet: their normals stay their own up to a voxel from it, where a neighbour's points count in full they would not."""
+    """Two walls intersect. Normals are right up to a voxel from the edge. With full weights of neighbours they would not be."""
     rng = np.random.default_rng(4)
     u, v = rng.uniform(0, 3, (2, 30000))
     walls = np.concatenate([np.stack([u, 0 * u, v], axis=1)[:15000], np.stack([0 * u, u, v], axis=1)[15000:]])
@@ -123,7 +123,7 @@ def test_the_lattice_goes_through_the_frames_zero():
 
 
 def test_sums_of_two_maps_with_other_origins_are_those_of_one(cloud):
-    """By single precision."""
+    """In single precision."""
     near = [lattice_origin(0.5, np.array(point)) for point in ((98.0, -50.0, 1.0), (140.3, -20.0, 5.0))]
     one, other, whole = (
         map_of(c, origin=o) for c, o in ((cloud[:500], near[0]), (cloud[500:], near[1]), (cloud, near[0]))
@@ -136,7 +136,7 @@ def test_sums_of_two_maps_with_other_origins_are_those_of_one(cloud):
 
 
 def test_statistics_by_hand():
-    """Two points in the voxel from (1, -0.5, 0) on, 0.5 m wide: its centre lies at (1.25, -0.25, 0.25)."""
+    """Two points in the voxel from (1, -0.5, 0), 0.5 m wide. Its centre is (1.25, -0.25, 0.25)."""
     found = map_of([[1.25, -0.25, 0.25], [1.35, -0.25, 0.05]], origin=(0.0, 0.0, 0.0)).statistics()
     assert found.dtype == VOXEL
     assert found["cell"].tolist() == [[2, -1, 0]]
@@ -151,7 +151,7 @@ def lit(points, intensity, **rest):
 
 
 def test_brightness_is_the_mean_over_the_returns_of_a_voxel():
-    """Four of the left voxel, one of the right; of the neighbour's none counts."""
+    """The left voxel has four returns, the right one has one. The neighbour's returns do not count."""
     points = [[0.1, 0.1, 0.1], [0.2, 0.3, 0.1], [0.3, 0.1, 0.2], [0.4, 0.4, 0.4], [0.6, 0.1, 0.1]]
     found = lit(points, [0.1, 0.2, 0.3, 0.6, 0.9], origin=(0.0, 0.0, 0.0)).surfels()
     np.testing.assert_allclose(found.brightness, [0.3, 0.9], rtol=1e-6)
@@ -184,7 +184,7 @@ def test_statistics_keep_brightness(cloud):
     np.testing.assert_allclose(one.surfels().brightness, expected, atol=1e-6)
 
 
-def test_statistics_of_an_older_map_say_nothing_of_brightness(cloud):
+def test_statistics_of_an_older_map_have_no_brightness(cloud):
     near = lattice_origin(0.5, np.array([98.0, -50.0, 1.0]))
     whole = lit(cloud, np.ones(len(cloud)), origin=near).statistics()
     older = np.zeros(len(whole), VOXEL_WITHOUT_BRIGHTNESS)
@@ -205,7 +205,7 @@ def test_moments_of_a_group_are_those_of_its_points():
         np.testing.assert_allclose(one, other, atol=1e-9)
 
 
-def test_forgotten_voxels_are_gone(cloud):
+def test_discarded_voxels_are_removed(cloud):
     voxels = map_of(cloud)
     means = voxels.means()
     voxels.keep(means[:, 0] < 101.0)
@@ -231,8 +231,8 @@ def test_two_voxels_within_reach_never_share_a_key_and_keep_their_place(one, oth
 
 
 @given(st.integers(0, 2), st.sampled_from([-1, 1]), st.floats(1.001, 1e9))
-def test_what_lies_beyond_the_keys_is_refused_instead_of_taken_for_something_near(axis, sign, times):
-    """At 0.3 m keys end after 157 km: a UTM position beside local ones fell into voxels of the map."""
+def test_points_beyond_the_voxel_keys_are_refused(axis, sign, times):
+    """At 0.3 m the keys end after 157 km. A UTM position among local ones fell into voxels of the map."""
     voxels = VoxelMap(0.3, np.zeros(3))
     point = np.zeros((2, 3))
     point[1, axis] = sign * times * voxels.reach_m
@@ -250,7 +250,7 @@ def test_a_coordinate_that_is_no_number_is_refused(number):
 
 
 def test_neighbours_of_the_farthest_voxels_are_theirs():
-    """One cell further, the neighbour's key along y would be that of a voxel at the other end, one row on."""
+    """One cell further, the y key of the neighbour would belong to a voxel at the other end, one row on."""
     voxels = VoxelMap(1.0, np.zeros(3))
     far = voxels.reach_m - 0.5
     ends = [[0.5, far, 0.5], [1.5, -far, 0.5]]

@@ -1,4 +1,4 @@
-"""A build that is killed goes on where it was, and never takes what was made of something else."""
+"""A killed build continues where it stopped. It never uses results of other input."""
 
 import json
 import os
@@ -19,7 +19,8 @@ from model_training.mapping.work import key_of, work_beside, work_folder
 from service.errors import BundleError, DatasetError
 from service.maps.reader import MapBundle
 
-SETTINGS = BuildSettings(name="small", headings=6, spacing_m=5.0, calibration=None, align_survey=False)
+#: No places between scans: the tests of the build kill a build with such places.
+SETTINGS = BuildSettings(name="small", headings=6, spacing_m=5.0, between_m=0.0, calibration=None, align_survey=False)
 
 
 class KilledError(Exception):
@@ -27,7 +28,7 @@ class KilledError(Exception):
 
 
 def files_of(folder):
-    """Every file of a bundle; the manifest without the moment it was made."""
+    """Return every file of a bundle; the manifest without its timestamp."""
     found = {str(p.relative_to(folder)): p.read_bytes() for p in sorted(folder.rglob("*")) if p.is_file()}
     manifest = json.loads(found["manifest.json"])
     del manifest["made_at"]
@@ -39,11 +40,19 @@ def small_chunks(monkeypatch):
     monkeypatch.setattr(work, "CHUNK", 3)
 
 
-@pytest.fixture
-def undisturbed(small_dataset, encoder_file, small_chunks, tmp_path):
-    out = tmp_path / "undisturbed" / "small"
-    build_map(small_dataset, encoder_file, out, SETTINGS, threads=1)
+@pytest.fixture(scope="module")
+def undisturbed_files(small_dataset, encoder_file, tmp_path_factory):
+    out = tmp_path_factory.mktemp("undisturbed") / "small"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(work, "CHUNK", 3)
+        build_map(small_dataset, encoder_file, out, SETTINGS, threads=1)
     return files_of(out)
+
+
+@pytest.fixture
+def undisturbed(undisturbed_files, small_chunks):
+    """Return the files of a build that nothing killed. The test's own builds use the same small chunks."""
+    return undisturbed_files
 
 
 def build_killed_at(place, dataset, encoder_file, out, settings=SETTINGS):
@@ -78,7 +87,7 @@ def test_a_build_killed_again_and_again_ends_with_the_same_bytes(small_dataset, 
 def test_a_build_killed_while_it_writes_leaves_no_bundle_and_goes_on(
     small_dataset, encoder_file, undisturbed, tmp_path, monkeypatch
 ):
-    """What a killed writer leaves is removed by the next."""
+    """The next build removes the remains of the killed one."""
     out = tmp_path / "small"
     (tmp_path / ".small.x1.partial").mkdir()
     with monkeypatch.context() as patch:
@@ -94,7 +103,7 @@ def test_a_build_killed_while_it_writes_leaves_no_bundle_and_goes_on(
     assert [event for event in told if event[0] != "writing"] == [
         (stage, done, count) for stage in ("places", "traffic") for done in ends
     ]
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["small", "undisturbed"]
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["small"]
 
 
 def test_a_part_that_lost_power_halved_is_made_again(small_dataset, encoder_file, undisturbed, tmp_path):
@@ -164,7 +173,7 @@ with work_beside(Path(sys.argv[1]), "k" * 24) as work:
 
 @pytest.fixture
 def holder(tmp_path):
-    """Another process that builds ``tmp_path / "m"``."""
+    """Start another process that builds ``tmp_path / "m"``."""
     process = subprocess.Popen(
         [sys.executable, "-c", _HOLDER, str(tmp_path / "m")], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
     )

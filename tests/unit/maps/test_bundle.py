@@ -16,7 +16,7 @@ from service.maps.reader import MapBundle
 from service.maps.writer import write_bundle
 
 
-def test_what_is_written_is_what_is_opened(content: BundleContent, bundle_path: Path) -> None:
+def test_the_written_bundle_is_opened_unchanged(content: BundleContent, bundle_path: Path) -> None:
     bundle = MapBundle.open(bundle_path)
     np.testing.assert_array_equal(bundle.T_map_place, content.T_map_place)
     np.testing.assert_array_equal(bundle.place_street, content.place_street)
@@ -33,8 +33,12 @@ def test_what_is_written_is_what_is_opened(content: BundleContent, bundle_path: 
     assert bundle.streets is not None
     assert [street.name for street in bundle.streets.features][-1] == "End of street 2"
     assert bundle.manifest.counts.model_dump() == {
-        "places": 12, "views": 48, "descriptor_size": 16, "cloud_points": len(content.cloud.surfels), "streets": 3,
-    }  # fmt: skip
+        "places": 12,
+        "views": 48,
+        "descriptor_size": 16,
+        "cloud_points": len(content.cloud.surfels),
+        "streets": 3,
+    }
 
 
 def test_arrays_are_mapped_and_read_only(bundle_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""Every way in which a bundle can be wrong is an error that names the file and the remedy."""
+"""Every defect of a bundle is an error that names the file and the remedy."""
 
 import hashlib
 import json
@@ -21,7 +21,7 @@ OUTSIDE = ["../outside.npy", "/etc/passwd", "cloud/../../outside.npy", "a//b", "
 
 
 def edit_manifest(bundle: Path, edit: Callable[[dict[str, Any]], object], *, stamp: bool = True) -> None:
-    """Change the manifest; with ``stamp`` its version follows, as a forger's would."""
+    """Change the manifest. With ``stamp`` its version matches, as after deliberate forgery."""
     document = json.loads((bundle / "manifest.json").read_text())
     edit(document)
     (bundle / "manifest.json").write_text(json.dumps(document))
@@ -31,7 +31,7 @@ def edit_manifest(bundle: Path, edit: Callable[[dict[str, Any]], object], *, sta
 
 
 def replace_file(bundle: Path, name: str, data: bytes) -> None:
-    """Put another file in and make the manifest agree, so that only the content's own check is left."""
+    """Replace a file and adapt the manifest, so that only the check of the content can fail."""
     (bundle / name).write_bytes(data)
     entry = {"sha256": hashlib.sha256(data).hexdigest(), "size": len(data)}
     edit_manifest(bundle, lambda document: document["files"].update({name: entry}))
@@ -65,7 +65,7 @@ def test_a_missing_file_is_refused(bundle_copy: Path, name: str) -> None:
 def test_a_file_that_vanishes_while_the_bundle_is_opened_is_refused(
     bundle_copy: Path, name: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """As when an operator removes it: all files were there when they were looked at."""
+    """An operator may remove it: all files existed when they were listed."""
 
     def looked_at(*arguments: Any, **changed: Any) -> None:
         original(*arguments, **changed)
@@ -245,7 +245,7 @@ def test_a_view_whose_heading_is_not_finite_is_refused(bundle_copy: Path, tmp_pa
 
 
 def test_views_that_do_not_lie_place_by_place_are_refused(bundle_copy: Path, tmp_path: Path) -> None:
-    """Every place has its four, but the last view of one and the first of the next are swapped."""
+    """Every place has four views, but the last view of one and the first of the next are swapped."""
     views = np.load(bundle_copy / "views.npy")
     views[[3, 4]] = views[[4, 3]]
     replace_file(bundle_copy, "views.npy", npy_bytes(tmp_path / "a.npy", views))
@@ -302,7 +302,7 @@ def test_a_georeference_of_anything_but_numbers_is_refused(bundle_copy: Path) ->
 @pytest.mark.parametrize("name", ["places.npy", "views.npy", "cloud/surfels.npy"])
 @pytest.mark.parametrize("byte", [0, 123, 255])
 def test_an_array_whose_header_is_no_text_is_refused(bundle_copy: Path, name: str, byte: int) -> None:
-    """Found by fuzzing: NumPy's reader of headers raises what Python's tokenizer does."""
+    """Found by fuzzing: NumPy's header reader raises errors of Python's tokenizer."""
     data = bytearray((bundle_copy / name).read_bytes())
     data[43] = byte
     replace_file(bundle_copy, name, bytes(data))

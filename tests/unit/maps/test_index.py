@@ -61,7 +61,7 @@ def test_a_few_views_are_compared_exactly(tmp_path: Path) -> None:
 
 
 def test_a_part_of_the_views_determines_the_axes_of_all(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Descriptors of trained encoders have a common part, and most of the rest lies along a few axes."""
+    """Descriptors of trained encoders have a common component. Most of the rest lies along a few axes."""
     rng = np.random.default_rng(3)
     descriptors = rng.normal(size=(3000, 256)) * np.geomspace(1, 1e-6, 256) + rng.normal(size=256)
     descriptors = (descriptors / np.linalg.norm(descriptors, axis=1, keepdims=True)).astype(np.float32)

@@ -15,7 +15,7 @@ HALF_X, HALF_Y, FLOOR, CEILING = 16.0, 9.0, -1.8, 4.0
 
 
 def hall(rng: np.random.Generator) -> np.ndarray:
-    """Points of floor, walls and pillars, map frame."""
+    """Return points of floor, walls and pillars, map frame."""
     n = 1500
     x, y, z = rng.uniform(-HALF_X, HALF_X, n), rng.uniform(-HALF_Y, HALF_Y, n), rng.uniform(FLOOR, CEILING, n)
     surfaces = [np.c_[x, y, np.full(n, FLOOR)]]
@@ -28,13 +28,13 @@ def hall(rng: np.random.Generator) -> np.ndarray:
 
 
 def pose_at(stamp_s: float) -> np.ndarray:
-    """3 m/s along the hall, turning slowly."""
+    """Return the pose at a time: 3 m/s along the hall, with a slow rotation."""
     return transform_from(rotation_z(0.1 * stamp_s), np.array([-6.0 + 3.0 * stamp_s, 0.5 * stamp_s, 0.0]))
 
 
 @dataclass
 class HallDrive:
-    """Scans of a hall, ten a second, 0.3 m apart."""
+    """Scans of a hall, ten per second, 0.3 m apart."""
 
     count_of_scans: int = 15
     moving: bool = False
@@ -51,7 +51,7 @@ class HallDrive:
 
     @property
     def truth(self) -> np.ndarray:
-        """T_first_lidar."""
+        """Return T_first_lidar of every scan."""
         return np.stack([inverse(pose_at(0.0)) @ pose_at(0.1 * k) for k in range(self.count_of_scans)])
 
     def events(self, *, pictures: bool = True) -> Iterator[Event]:

@@ -1,4 +1,4 @@
-"""Poses that were given wrongly in a hall whose every pose is known."""
+"""Given poses with errors, in a hall with known poses."""
 
 import sys
 from dataclasses import dataclass
@@ -22,14 +22,14 @@ STAMPS_S = np.arange(0.0, 1.401, 0.05)  # twice as often as the scans
 
 
 def given(error_of):
-    """Poses with an error (x, y) at each moment."""
+    """Return poses with an error (x, y) at each time."""
     poses = np.stack([pose_at(t) for t in STAMPS_S])
     poses[:, :2, 3] += np.array([error_of(t) for t in STAMPS_S])
     return Trajectory(STAMPS_S, poses, "given")
 
 
 def swinging(t):
-    """0.15 m to each side, once a second: steps from scan to scan are off by up to 0.09 m."""
+    """Return a lateral error of 0.15 m, once per second: steps between scans are wrong by up to 0.09 m."""
     return 0.15 * np.array([np.sin(2 * np.pi * t), np.cos(2 * np.pi * t)])
 
 
@@ -84,7 +84,7 @@ def test_progress_ends_with_all():
 
 
 def test_a_drift_is_held_by_given_poses():
-    """Steps that are 0.3 % too long, over a kilometre: the end would be 3 m off."""
+    """Steps are 0.3 % too long over a kilometre. Without given poses the end would be 3 m wrong."""
     true = np.stack([transform_from(np.eye(3), np.array([2.0 * k, 0.0, 0.0])) for k in range(500)])
     drifted = true.copy()
     drifted[:, 0, 3] *= 1.003
@@ -98,7 +98,7 @@ class Raw(HallDrive):
     kind: str = "kitti-raw"
 
 
-def test_only_formats_with_inertial_poses_are_aligned_unless_told():
+def test_only_formats_with_inertial_poses_are_aligned_by_default():
     wrong = given(swinging)
     assert usual_poses(HallDrive(), wrong) == (wrong, None)
     assert usual_poses(Raw(), wrong, align=False) == (wrong, None)

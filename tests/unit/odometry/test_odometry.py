@@ -1,4 +1,4 @@
-"""Odometry on a hall whose every pose is known; loops by descriptors that are turned; a pose graph on a square."""
+"""Odometry in a hall with known poses, loops by rotated descriptors, and a pose graph on a square."""
 
 from typing import Any
 
@@ -98,7 +98,7 @@ def keyframe(index, T, descriptors=None):
 
 
 def square(*, turn_rad_m=0.0, stretch=1.0):
-    """Once round a square of 25 m, a keyframe a metre, with two scans each; ``turn_rad_m`` and ``stretch`` are its drift."""
+    """Return a square path of 25 m sides: a keyframe per metre with two scans each. ``turn_rad_m`` and ``stretch`` are the drift."""
     T, poses = np.eye(4), []
     for k in range(101):
         poses.append(T)
@@ -151,7 +151,7 @@ def test_without_loops_odometry_stays_and_scans_between_keyframes_follow_theirs(
     np.testing.assert_allclose(step, transform_from(np.eye(3), np.array([0.5, 0.0, 0.0])), atol=1e-9)
 
 
-def test_disagreement_is_the_mean_distance_from_what_the_loops_say():
+def test_disagreement_is_the_mean_distance_from_the_loop_constraints():
     poses = np.stack([np.eye(4), transform_from(np.eye(3), np.array([3.0, 4.0, 0.0]))])
     here = Loop(0, 1, np.eye(4), 0.9, 0.9)
     there = Loop(0, 1, poses[1], 0.9, 0.9)
@@ -160,8 +160,8 @@ def test_disagreement_is_the_mean_distance_from_what_the_loops_say():
     assert disagreement_m(poses, []) == 0.0
 
 
-def test_a_place_that_is_only_alike_is_not_registered(tmp_path):
-    """Two places far apart by odometry, whose views are the same: too far for drift, so no loop is looked for."""
+def test_a_perceptual_alias_is_not_registered(tmp_path):
+    """Two places have equal views, but by odometry they are too far apart for drift. So no loop is searched."""
     views = np.ones((24, 8), np.float32) / np.sqrt(8).astype(np.float32)
     near, far = (transform_from(np.eye(3), np.array([x, 0.0, 0.0])) for x in (0.0, 100.0))
     keyframes = (keyframe(0, near, views), Keyframe(4, 1.0, far, 100.0, NO_LEVEL, 0.0, views))

@@ -23,7 +23,7 @@ def angle_deg(R, other):
 
 
 def scored(cloud, points, states, **options):
-    """Share of inliers of starts that are left where they are."""
+    """Return the share of inliers of starts without solver iterations."""
     states = states.copy()
     still = SolverOptions(iterations=0, reach=1.2, robust_first=1.0, robust_last=1.0)
     align(cloud.grid, cloud.surfels, points, states, still, **options)
@@ -52,8 +52,8 @@ def test_from_a_metre_and_five_degrees_away_the_true_pose_comes_back(
 
 
 @pytest.mark.parametrize(("away_m", "most", "converged"), [(0.3, 1, False), (0.0, 20, True)])
-def test_a_state_tells_how_the_solver_ended(street_map, seen, pose, start_at, away_m, most, converged):
-    """One step of a decimetre has not converged; at the true pose the solver stops long before its last iteration."""
+def test_the_state_contains_how_the_solver_ended(street_map, seen, pose, start_at, away_m, most, converged):
+    """After one step of a decimetre the solver has not converged. At the true pose it stops long before its last iteration."""
     states = start_at(pose[0], pose[1] + [away_m, 0.0, 0.0])
     options = SolverOptions(iterations=most, reach=1.2, robust_first=0.06, robust_last=0.06)
     align(street_map.grid, street_map.surfels, seen, states, options)
@@ -62,7 +62,7 @@ def test_a_state_tells_how_the_solver_ended(street_map, seen, pose, start_at, aw
 
 
 def test_the_error_is_half_the_weighted_squared_distance(street_map, points_at, start_at):
-    """One point 0.1 m in front of a facade, square to it, with 0.05 m of noise and a kernel so wide that it has no effect."""
+    """One point is 0.1 m in front of a wall that faces it, with noise 0.05 m. The robust kernel is too wide to have an effect."""
     points = points_at([[0.0, 5.9, 0.0]], sigma=0.05)
     states = start_at(np.eye(3), np.array([0.0, 0.0, 1.5]))
     options = SolverOptions(iterations=1, reach=1.2, robust_first=1e6, robust_last=1e6, surface=0.0, prior_weight=1e9)
@@ -87,7 +87,7 @@ def test_a_depth_that_is_a_hundredth_too_long_or_short_is_recovered(street_map, 
 
 
 def test_a_disparity_offset_is_recovered(street_map, seen, pose, start_at, settle):
-    """A point of true depth z that is measured with 0.3 px too little disparity lies at z / (1 - 0.3 z / (f b))."""
+    """A point at true depth z with 0.3 px too little disparity appears at z / (1 - 0.3 z / (f b))."""
     stretch = 1 / (1 - 0.3 * seen.q)
     wrong = replace(seen, xyz=seen.xyz * stretch[:, None], q=seen.q * stretch)
     found = settle(street_map, wrong, start_at(*pose), free_scale=False, free_offset=True)[0]
@@ -95,7 +95,7 @@ def test_a_disparity_offset_is_recovered(street_map, seen, pose, start_at, settl
     np.testing.assert_allclose(found["t"], pose[1], atol=0.02)
 
 
-def test_what_is_not_free_stays(street_map, seen, pose, start_at, settle):
+def test_fixed_unknowns_stay(street_map, seen, pose, start_at, settle):
     wrong = replace(seen, xyz=seen.xyz * np.float32(1.01))
     start = start_at(*pose, log_scale=0.002, offset=0.1)
     found = settle(street_map, wrong, start, free_scale=False, free_offset=False)[0]
@@ -110,7 +110,7 @@ def test_without_iterations_nothing_moves_and_the_score_alone_is_written(street_
     assert 0 < found["inliers"][0] < 1
 
 
-def test_faultless_points_score_one_at_their_pose(street_map, seen, pose, start_at):
+def test_exact_points_score_one_at_their_pose(street_map, seen, pose, start_at):
     # Where two rectangles meet, the nearest surfel may be the other's.
     assert scored(street_map, seen, start_at(*pose))["inliers"][0] > 0.98
 
@@ -123,7 +123,7 @@ def test_the_score_falls_the_further_the_points_are_moved(street_map, seen, pose
 
 @pytest.fixture
 def plain(scene_of):
-    """A ground of 12 x 12 m about the origin: its surfels and grid, as ``align`` takes them."""
+    """Return surfels and grid of a ground of 12 x 12 m about the origin, as ``align`` takes them."""
     surfels = scene_of(((-6, -6, 0), (12, 0, 0), (0, 12, 0))).surfels()
     return nearest_grid(surfels, cell_m=0.4, reach_m=1.2), surfels
 
@@ -145,14 +145,14 @@ def test_a_point_off_the_surface_counts_by_the_tolerance(plain, points_at, start
 
 
 def test_the_uncertainty_along_the_ray_widens_the_tolerance(plain, points_at, start_at):
-    """Straight down the ray is the normal: 0.3 m off with sigma 0.4 and tolerance 0.3 is 0.6 deviations."""
+    """The ray is along the normal. With sigma 0.4 and tolerance 0.3, 0.3 m are 0.6 standard deviations."""
     points = points_at([[0, 0, -1.5]], sigma=0.4)
     found = share(plain, points, start_at(np.eye(3), [0, 0, 1.8]), tolerance_m=0.3)
     assert found == pytest.approx(np.exp(-0.5 * 0.36), abs=1e-5)
 
 
-def test_the_uncertainty_counts_only_as_far_as_its_ray_meets_the_surface(plain, points_at, start_at):
-    """The ray of 3-4-5 meets the ground with cosine 0.6: sigma 0.5 is 0.3 across, with tolerance 0.4 it is 0.5."""
+def test_only_the_component_of_the_uncertainty_along_the_normal_counts(plain, points_at, start_at):
+    """A 3-4-5 ray hits the ground at cosine 0.6. Sigma 0.5 is 0.3 across the ground, and with tolerance 0.4 it is 0.5."""
     points = points_at([[2, 0, -1.5]], sigma=0.5)
     found = share(plain, points, start_at(np.eye(3), [0, 0, 2.0]), tolerance_m=0.4)
     assert found == pytest.approx(np.exp(-0.5), abs=1e-5)
@@ -162,7 +162,7 @@ def test_the_uncertainty_counts_only_as_far_as_its_ray_meets_the_surface(plain, 
 def test_a_point_beyond_the_edge_of_its_surface_counts_if_that_is_within_its_uncertainty(
     plain, points_at, start_at, sigma, expected
 ):
-    """1.1 m beyond the last surfel: a metre is allowed, and with sigma 0.5 the root of two."""
+    """The point is 1.1 m beyond the last surfel. The limit is 1 m, and sqrt(2) m with sigma 0.5."""
     points = points_at([[6.95, 0.15, -1.5]], sigma=sigma)
     assert share(plain, points, start_at(np.eye(3), [0, 0, 1.5])) == pytest.approx(expected, abs=1e-5)
 
@@ -172,7 +172,7 @@ def test_a_point_off_the_map_is_no_inlier(plain, points_at, start_at):
     assert share(plain, points, start_at(np.eye(3), [0, 0, 1.5])) == pytest.approx(0.5, abs=1e-6)
 
 
-def test_points_below_the_limit_have_no_say_in_the_score(plain, points_at, start_at):
+def test_points_below_the_limit_do_not_count_in_the_score(plain, points_at, start_at):
     points = points_at([*ON_GROUND, [1, 1, 4]], sigma=0.0)
     start = start_at(np.eye(3), [0, 0, 1.5])
     assert share(plain, points, start, height_min_m=-1.2) == 0
@@ -180,7 +180,7 @@ def test_points_below_the_limit_have_no_say_in_the_score(plain, points_at, start
 
 
 def test_a_score_weighs_points_by_their_weight_and_their_certainty(plain, points_at, start_at):
-    """Four of weight 3 lie on the ground; one of weight 1 and sigma 0.5 hangs in the air and counts half."""
+    """Four points of weight 3 are on the ground. One of weight 1 and sigma 0.5 is above it and counts half."""
     points = points_at([*ON_GROUND, [1, 1, 4]], weight=[3, 3, 3, 3, 1])
     points = replace(points, sigma=np.array([0, 0, 0, 0, 0.5], np.float32))
     start = start_at(np.eye(3), [0, 0, 1.5])
@@ -195,7 +195,7 @@ def test_points_of_weight_zero_do_not_matter(street_map, seen, pose, start_at, s
     np.testing.assert_allclose(among["t"], alone["t"], atol=1e-4)
     np.testing.assert_allclose(among["R"], alone["R"], atol=1e-5)
     assert among["inliers"] == pytest.approx(alone["inliers"], abs=1e-4)
-    assert among["seen"] == alone["seen"]
+    assert among["matched"] == alone["matched"]
     heavy = replace(junk, weight=np.full_like(junk.weight, 3))
     assert settle(street_map, joined(seen, heavy), start)[0]["inliers"] < alone["inliers"] - 0.2
 
@@ -209,28 +209,28 @@ def test_a_car_that_has_moved_by_half_a_metre_hardly_moves_the_pose(street_map, 
     np.testing.assert_allclose(found["t"], pose[1], atol=0.03)
 
 
-def test_seen_is_the_weight_of_the_points_that_met_the_map(plain: Pair, points_at, start_at):
+def test_matched_is_the_weight_of_points_with_a_surfel(plain: Pair, points_at, start_at):
     points = points_at([*ON_GROUND, [1, 1, 4], [500, 0, 0]], weight=[1, 2, 3, 4, 50, 60])
     start = start_at(np.eye(3), [0, 0, 1.5])
     align(*plain, points, start, SolverOptions(iterations=1, reach=1.2, robust_first=1.0, robust_last=1.0))
-    assert start["seen"][0] == 10
+    assert start["matched"][0] == 10
 
 
 def test_a_point_further_than_reach_from_its_surfel_is_left_out(plain: Pair, points_at, start_at):
-    """The grid reaches 1.2 m; the solver is told to look 0.5 m far."""
+    """The grid reaches 1.2 m, but the solver option is 0.5 m."""
     points = points_at(ON_GROUND)
     near, far = start_at(np.eye(3), [0, 0, 1.9]), start_at(np.eye(3), [0, 0, 2.1])
     for start in (near, far):
         align(*plain, points, start, SolverOptions(iterations=1, reach=0.5, robust_first=1.0, robust_last=1.0))
-    assert near["seen"][0] == 4
-    assert far["seen"][0] == 0
+    assert near["matched"][0] == 4
+    assert far["matched"][0] == 0
 
 
 def test_several_starts_at_once_give_the_same_as_one_by_one(street_map, seen, pose, start_at, settle):
     rng = np.random.default_rng(6)
-    starts = np.concatenate([
-        start_at(turned(pose[0], yaw_deg=rng.uniform(-5, 5)), pose[1] + rng.uniform(-0.5, 0.5, 3)) for _ in range(5)
-    ])  # fmt: skip
+    starts = np.concatenate(
+        [start_at(turned(pose[0], yaw_deg=rng.uniform(-5, 5)), pose[1] + rng.uniform(-0.5, 0.5, 3)) for _ in range(5)]
+    )
     together = settle(street_map, seen, starts)
     one_by_one = np.concatenate([settle(street_map, seen, starts[k : k + 1]) for k in range(5)])
     assert together.tobytes() == one_by_one.tobytes()
@@ -285,8 +285,8 @@ def test_a_step_turns_by_a_tenth_of_a_radian_at_most(plain: Pair, points_at, sta
     np.testing.assert_allclose(start["R"][0], rotation_y(0.4), atol=1e-9)
 
 
-def test_the_height_prior_gives_way_to_what_the_points_say(plain: Pair, points_at, start_at):
-    """The anchor says 1.7 m; all points say 1.5 m, each as surely as 3 cm against a twentieth of 15 cm."""
+def test_points_outweigh_the_height_prior(plain: Pair, points_at, start_at):
+    """The anchor is at 1.7 m, and all points imply 1.5 m. Each point has sigma 3 cm, the prior 15 cm with a weight of 1/20."""
     rng = np.random.default_rng(7)
     points = points_at(np.c_[rng.uniform(-4, 4, (200, 2)), np.full(200, -1.5)], sigma=0.0)
     start = start_at(np.eye(3), [0, 0, 1.7])

@@ -1,4 +1,4 @@
-"""The kernel looks points up 32 at a time: nothing it finds may depend on where one batch ends and the next begins."""
+"""The kernel processes 32 points at a time. Results must not depend on the batch boundaries."""
 
 from dataclasses import fields
 from typing import Any
@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from service.geometry.rigid import rotation_z
-from service.registration.kernel import QueryPoints, SolverOptions, align, pulls
+from service.registration.kernel import QueryPoints, SolverOptions, align, gradients
 
 AROUND_A_BATCH = [0, 1, 2, 31, 32, 33, 63, 64, 65, 96, 97]
 SOLVE = SolverOptions(iterations=8, reach=1.2, robust_first=0.8, robust_last=0.1, free_offset=True)
@@ -24,7 +24,7 @@ def joined(*parts):
 
 @pytest.fixture(scope="module")
 def mixed(seen):
-    """Points of the street in no order, of differing weight and certainty, a tenth of them where the map is empty."""
+    """Return points of the street in random order with various weights and sigmas. A tenth lie where the map is empty."""
     rng = np.random.default_rng(4)
     rows = rng.permutation(len(seen))[:400]
     some = seen.subset(rows)
@@ -35,7 +35,7 @@ def mixed(seen):
 
 @pytest.fixture(scope="module")
 def solved(street_map, pose, start_at):
-    """What the solver makes of points from a start a little off, all of its state; the score is of points above the ground."""
+    """Return the state after the solver, from a start with a small error. The score counts points above the ground."""
 
     def solve(points, options):
         state = start_at(rotation_z(0.03) @ pose[0], pose[1] + [0.2, -0.1, 0.05], log_scale=0.002, offset=0.05)
@@ -57,13 +57,13 @@ def test_points_that_weigh_nothing_only_move_the_bounds_of_batches(mixed, solved
 
 @given(first=st.integers(0, 130), second=st.integers(0, 130), seed=st.integers(0, 10**6))
 @settings(max_examples=60)
-def test_a_set_of_points_says_what_its_parts_say_together(mixed, solved, first, second, seed):
-    """Information and what was met are sums over the parts, the score is their mean by weight."""
+def test_the_result_of_a_set_is_the_sum_of_its_parts(mixed, solved, first, second, seed):
+    """Information and matched weight are sums over the parts. The score is their weighted mean."""
     rows = np.random.default_rng(seed).permutation(len(mixed))
     parts = [mixed.subset(rows[:first]), mixed.subset(rows[first : first + second])]
     whole, (one, other) = solved(joined(*parts), ONE_STEP), (solved(part, ONE_STEP) for part in parts)
     np.testing.assert_allclose(whole["information"], one["information"] + other["information"], **SUM)
-    assert whole["seen"] == pytest.approx(one["seen"] + other["seen"])
+    assert whole["matched"] == pytest.approx(one["matched"] + other["matched"])
     whole, (one, other) = solved(joined(*parts), STILL), (solved(part, STILL) for part in parts)
     assert whole["weight"] == pytest.approx(one["weight"] + other["weight"])
     together = one["inliers"] * one["weight"] + other["inliers"] * other["weight"]
@@ -71,11 +71,11 @@ def test_a_set_of_points_says_what_its_parts_say_together(mixed, solved, first, 
 
 
 @pytest.mark.parametrize("count", AROUND_A_BATCH[1:])
-def test_points_together_say_what_they_say_one_by_one(mixed, solved, count):
+def test_the_information_of_points_is_the_sum_of_single_ones(mixed, solved, count):
     alone = [solved(mixed.subset(np.array([k])), ONE_STEP) for k in range(count)]
     whole = solved(mixed.subset(np.arange(count)), ONE_STEP)
     np.testing.assert_allclose(whole["information"], np.sum([each["information"] for each in alone], axis=0), **SUM)
-    assert whole["seen"] == pytest.approx(sum(each["seen"] for each in alone))
+    assert whole["matched"] == pytest.approx(sum(each["matched"] for each in alone))
     alone = [solved(mixed.subset(np.array([k])), STILL) for k in range(count)]
     whole = solved(mixed.subset(np.arange(count)), STILL)
     assert whole["weight"] == pytest.approx(sum(each["weight"] for each in alone))
@@ -83,12 +83,12 @@ def test_points_together_say_what_they_say_one_by_one(mixed, solved, count):
 
 
 @pytest.mark.parametrize("count", AROUND_A_BATCH[1:])
-def test_points_pull_together_as_they_pull_one_by_one(mixed, street_map, pose, start_at, count):
+def test_the_gradient_of_points_is_the_sum_of_single_gradients(mixed, street_map, pose, start_at, count):
     start = start_at(rotation_z(0.03) @ pose[0], pose[1] + [0.2, -0.1, 0.05], log_scale=0.002, offset=0.05)
 
     def pulled(rows):
         patch = np.arange(len(rows), dtype=np.int32)
-        return pulls(street_map.grid, street_map.surfels, mixed.subset(rows), start, ONE_STEP, patch)
+        return gradients(street_map.grid, street_map.surfels, mixed.subset(rows), start, ONE_STEP, patch)
 
     alone = np.concatenate([pulled(np.array([k])) for k in range(count)])
     np.testing.assert_array_equal(pulled(np.arange(count)), alone)
@@ -107,11 +107,11 @@ def test_the_order_of_the_points_does_not_move_the_pose(mixed, solved, seed, cou
 
 @pytest.mark.parametrize("far", [1e3, -1e3, 1e9, -1e9, 1e20, -1e20, np.inf, -np.inf, np.nan])
 @pytest.mark.parametrize("at", [0, 31, 32, 40])
-def test_a_point_that_lies_nowhere_near_the_map_meets_nothing_wherever_it_stands(mixed, solved, far, at):
-    """Its place in the batch is that of a point that weighs nothing, so that all others keep theirs."""
+def test_a_point_far_from_the_map_has_no_surfel_at_any_batch_position(mixed, solved, far, at):
+    """It takes the batch position of a point with weight 0, so all others keep theirs."""
     found = mixed.subset(np.arange(64))
     found.weight[at] = 0
-    expected = solved(found, ONE_STEP)["seen"], solved(found, STILL)["inliers"]
+    expected = solved(found, ONE_STEP)["matched"], solved(found, STILL)["inliers"]
     found.xyz[at] = far
     with np.errstate(invalid="ignore"):
-        assert (solved(found, ONE_STEP)["seen"], solved(found, STILL)["inliers"]) == expected
+        assert (solved(found, ONE_STEP)["matched"], solved(found, STILL)["inliers"]) == expected

@@ -32,16 +32,18 @@ def covariance_of(information, scatter, noise, model=MODEL, heading_rad=0.0):
 
 @pytest.fixture(autouse=True)
 def counted(monkeypatch):
-    """What these tests count on."""
+    """Constants that these tests assume."""
     numbers = {
-        "AT_NOISE": NOISE, "LEAST": NOISE / 16, "MOST": 16 * NOISE,
-    }  # fmt: skip
+        "AT_NOISE": NOISE,
+        "LEAST": NOISE / 16,
+        "MOST": 16 * NOISE,
+    }
     for name, value in numbers.items():
         monkeypatch.setattr(covariance, name, value)
 
 
 def random_information(seed, rows, scale):
-    """Of so many points of random gradients."""
+    """Return the information of several points with random gradients."""
     gradients = np.random.default_rng(seed).normal(size=(rows, 8))
     return scale * gradients.T @ gradients
 
@@ -62,9 +64,9 @@ def without_floor(information, scatter, noise=NOISE, model=MODEL):
 def test_deviations_of_points_are_stretched_by_a_factor_of_the_noise_within_limits_and_of_patches_by_one(
     noise, independent
 ):
-    """A centimetre by the points' information, two by the patches' scatter: their variances add, and that of the floor.
+    """1 cm from the information of the points and 2 cm from the scatter of the patches add in variance, and so does the floor.
 
-    Points by the square root of the noise, twice at a thousandth, never below a sixteenth of that or above 16 times.
+    The first part grows with the square root of the noise: factor 2 at 0.001, limited to 1/16 and 16.
     """
     found = covariance_of(1e4 * np.eye(8), 4e4 * np.eye(8), noise)
     expected = (independent * 0.01) ** 2 + (3.0 * 0.02) ** 2 + FLOOR[:2] ** 2
@@ -72,7 +74,7 @@ def test_deviations_of_points_are_stretched_by_a_factor_of_the_noise_within_limi
 
 
 @given(st.integers(0, 10**6), st.sampled_from([1.0, 1e3, 1e6]))
-def test_patches_that_agree_leave_what_independent_points_know(seed, scale):
+def test_without_scatter_the_covariance_is_that_of_independent_points(seed, scale):
     information = random_information(seed, 20, scale)
     expected = np.linalg.inv(information / 4 + np.linalg.inv(PRIOR))[:6, :6] + np.diag(FLOOR**2)
     np.testing.assert_allclose(covariance_of(information, NONE, NOISE), expected, rtol=1e-6, atol=1e-12)
@@ -80,7 +82,7 @@ def test_patches_that_agree_leave_what_independent_points_know(seed, scale):
 
 @given(st.integers(0, 10**6))
 def test_where_scatter_is_the_information_the_sandwich_is_the_usual_covariance(seed):
-    """Nine times the inverse for the patches and four times for the points; the priors are nothing beside so many of them."""
+    """The factor is 9 for patches and 4 for points. With so many points the priors have no effect."""
     information = random_information(seed, 40, 1e9)
     inverse = np.linalg.inv(information)[:6, :6]
     shared = covariance_of(information, information, NOISE) - covariance_of(information, NONE, NOISE)
@@ -91,7 +93,7 @@ def test_where_scatter_is_the_information_the_sandwich_is_the_usual_covariance(s
 
 
 def test_patches_that_disagree_in_one_way_make_that_way_alone_uncertain():
-    """Along x by 100 and yaw by 200 together; a cm and a hundredth of a radian for each hundred, times three, and they go together."""
+    """Gradients of 100 along x and 200 along yaw: 1 cm and 0.01 rad per hundred, times three, fully correlated."""
     pull = np.array([100.0, 0, 0, 0, 0, -200.0, 0, 0])
     shared = covariance_of(1e4 * np.eye(8), np.outer(pull, pull), NOISE) - covariance_of(1e4 * np.eye(8), NONE, NOISE)
     expected = np.zeros((6, 6))
@@ -127,7 +129,7 @@ def test_more_information_of_patches_that_agree_means_less_variance_in_every_dir
 
 @pytest.mark.parametrize("patches", [0.0, 1.0, 30.0])
 def test_more_information_about_every_unknown_means_strictly_less_variance(patches):
-    """With scatter that grows as fast, as it does with the number of patches."""
+    """The scatter grows by the same factor, as with more patches."""
     information = random_information(1, 20, 1e3)
     variances = [np.diag(covariance_of(k * information, k * patches * information, NOISE)) for k in (1, 4, 16)]
     assert (variances[0] > variances[1]).all()
@@ -135,7 +137,7 @@ def test_more_information_about_every_unknown_means_strictly_less_variance(patch
 
 
 @pytest.mark.parametrize("noise", [0.0, NOISE, 1.0])
-def test_without_information_what_is_known_beside_the_points_remains(noise):
+def test_without_information_the_priors_remain(noise):
     expected = np.diag(PRIOR_SIGMA**2 + FLOOR**2)
     np.testing.assert_allclose(covariance_of(NONE, NONE, noise), expected, rtol=1e-9)
 
@@ -151,7 +153,7 @@ def test_endless_information_leaves_the_floor_of_each_axis(scatter):
     [(NOISE, [1, 1, 1, 0.5, 0.5, 1]), (16 * NOISE, [1, 1, 0.25, 0.5, 0.5, 2]), (NOISE / 16, [1, 1, 4, 0.5, 0.5, 0.5])],
 )
 def test_axes_are_stretched_by_factors_of_their_own_but_not_their_floor(noise, factors):
-    """Deviations are; so correlations stay as they are, and so does the floor."""
+    """The factors stretch standard deviations, so correlations stay equal. The floor stays equal too."""
     information, scatter = random_information(3, 30, 1e3), random_information(4, 30, 1e4)
     plain = without_floor(information, scatter, noise)
     stretched = replace(MODEL, axes=(1.0, 1.0, 1.0, 0.5, 0.5, 1.0), axes_power=(0.0, 0.0, -0.5, 0.0, 0.0, 0.25))
@@ -162,7 +164,7 @@ def test_axes_are_stretched_by_factors_of_their_own_but_not_their_floor(noise, f
 
 @given(st.integers(0, 10**6), st.floats(-7, 7))
 def test_along_and_across_the_view_are_stretched_wherever_it_points(seed, heading):
-    """Turning all that is known along with the view turns the covariance; and its floor, the same in x and y, stays."""
+    """If everything known rotates with the view, the covariance rotates too. Its floor is equal in x and y."""
     known, patches = random_information(seed, 30, 1e3), random_information(seed + 1, 30, 1e4)
     model = replace(MODEL, axes=(2.0, 0.5, 1.0, 0.7, 1.4, 1.0))
     turn = np.eye(8)
@@ -175,7 +177,7 @@ def test_along_and_across_the_view_are_stretched_wherever_it_points(seed, headin
 
 @pytest.mark.parametrize("disagree", [0.0, 1.0])
 def test_an_unknown_scale_costs_certainty(disagree):
-    """Points that only know the sum of x and the log scale know x no better than the scale, by 0.01, however well they agree."""
+    """All points constrain only the sum of x and log scale. So x has at least the uncertainty of the scale, 0.01."""
     information = np.zeros((8, 8))
     information[np.ix_([0, 6], [0, 6])] = 1e8
     x = without_floor(information, disagree * information)[0, 0]
@@ -185,7 +187,7 @@ def test_an_unknown_scale_costs_certainty(disagree):
 @pytest.mark.parametrize("disagree", [0.0, 3.0])
 @pytest.mark.parametrize("heading_deg", [0, 30, 120])
 def test_in_a_corridor_the_position_along_it_is_the_least_known(scene_of, start_at, settle, heading_deg, disagree):
-    """Whether its walls agree on the rest or not."""
+    """Holds for consistent and for inconsistent walls."""
     R = rotation_z(np.deg2rad(heading_deg))
     flat = [
         ((-30, -4, 0), (60, 0, 0), (0, 8, 0)),
@@ -204,3 +206,22 @@ def test_in_a_corridor_the_position_along_it_is_the_least_known(scene_of, start_
     assert abs(axes[:, 2] @ R[:, 0]) > 0.999
     assert variances[2] > 1000 * variances[1]
     assert np.sqrt(variances[1]) < 0.05
+
+
+def test_a_survey_with_usual_errors_adds_nothing():
+    """The floors include this error. A map without a stated accuracy counts as usual."""
+    for usual in ((None, None), (0.03, 0.05), (0.0, 0.0)):
+        np.testing.assert_array_equal(covariance.survey_covariance(*usual), np.zeros((6, 6)))
+
+
+def test_a_poor_survey_adds_the_excess_of_its_variance():
+    """0.05^2 - 0.03^2 = 0.04^2 m^2, and 0.13^2 - 0.05^2 = 0.12^2 square degrees."""
+    found = covariance.survey_covariance(0.05, 0.13)
+    np.testing.assert_allclose(np.sqrt(np.diag(found)), [0.04] * 3 + [np.deg2rad(0.12)] * 3)
+    np.testing.assert_array_equal(found, np.diag(np.diag(found)))
+
+
+def test_the_rectification_of_a_stereo_pair_tilts_the_pose():
+    found = covariance.rectification_covariance()
+    tilt = np.deg2rad(covariance.RECTIFICATION_DEG)
+    np.testing.assert_allclose(np.sqrt(np.diag(found)), [0, 0, 0, tilt, tilt, 0])

@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from service.registration.covariance import PATCH_RAD, disagreement, patches, score_outer_product
-from service.registration.kernel import align, pulls
+from service.registration.kernel import align, gradients
 from service.registration.register import Registered, RegistrationSettings
 from service.registration.surfel_map import SurfelMap
 
@@ -44,7 +44,7 @@ def test_rays_of_a_fifth_of_a_radian_share_a_patch(one, other, same):
 
 @given(st.integers(0, 10**6), st.integers(0, 300), st.sampled_from([0.1, 0.5, np.pi]))
 def test_patches_are_numbered_without_gaps_and_hold_the_rays_of_one_cell(seed, count, wide):
-    """All directions there are, but for those so near a bound that rounding may put them on either side."""
+    """All directions are tested, except those so close to a bound that rounding decides."""
     rng = np.random.default_rng(seed)
     cell = np.stack([rng.integers(-15, 15, count), rng.integers(-7, 7, count)], axis=1)
     cell = np.rint(cell * wide / np.pi).astype(int)
@@ -57,7 +57,7 @@ def test_patches_are_numbered_without_gaps_and_hold_the_rays_of_one_cell(seed, c
 
 
 def test_straight_up_and_down_are_directions_too():
-    """Whose upward share rounding may make larger than 1."""
+    """Rounding may make the vertical component larger than 1."""
     longer = np.nextafter(np.float32(1), np.float32(2))
     found = patches(np.array([[0, 0, 1], [0, 0, longer], [0, 0, -1], [0, 0, -longer]], np.float32))
     assert found[0] == found[1]
@@ -67,14 +67,14 @@ def test_straight_up_and_down_are_directions_too():
 
 @pytest.fixture(scope="module")
 def city(street):
-    """The street as a map that is told from another origin than its own."""
+    """Return the street as a map with another origin."""
     surfels = street.surfels()
     return SurfelMap.prepare(ORIGIN, surfels, np.array([[9.0, 0.0, 0.0, len(surfels)]]))
 
 
 @pytest.fixture(scope="module")
 def wrong(seen):
-    """Points of the street, in error by their deviation, of differing weight."""
+    """Return points of the street with errors of their sigma and various weights."""
     rng = np.random.default_rng(3)
     sigma, weight = rng.uniform(0.02, 0.2, len(seen)), rng.choice([0.1, 1.0], len(seen))
     off = (sigma * rng.normal(size=len(seen)))[:, None].astype("f4")
@@ -90,21 +90,21 @@ def registered(pose, *, scale=1.0, offset=0.0, away=0.0):
 
 
 def by_patch(city, points, start, options):
-    """What each patch pulls by when it is asked alone."""
+    """Return the gradient of each patch, computed separately."""
     number = patches(points.ray)
     parts = [points.subset(np.flatnonzero(number == each)) for each in range(number.max() + 1)]
-    return [pulls(city.grid, city.surfels, p, start, options, np.zeros(len(p), np.int32))[0] for p in parts]
+    return [gradients(city.grid, city.surfels, p, start, options, np.zeros(len(p), np.int32))[0] for p in parts]
 
 
 @given(st.integers(0, 10**6), st.integers(1, 400), st.floats(0.97, 1.03), st.floats(-0.2, 0.2))
 @settings(max_examples=30)
-def test_scatter_is_the_sum_of_outer_products_of_the_patches_pulls(
+def test_scatter_is_the_sum_of_outer_products_of_patch_gradients(
     city, wrong, pose, start_at, seed, count, scale, offset
 ):
-    """At the pose, scale and offset that were found, under the last options; no point weighs less than at the end."""
+    """At the registered pose, scale and offset, with the last options. The least weight of the last stage applies."""
     points = wrong.subset(np.sort(np.random.default_rng(seed).permutation(len(wrong))[:count]))
     start = start_at(*pose, log_scale=np.log(scale), offset=offset)
-    each = by_patch(city, points.weighing_at_least(0.5), start, SETTINGS.fine)
+    each = by_patch(city, points.with_least_weight(0.5), start, SETTINGS.fine)
     expected = np.zeros((8, 8))
     for pull in each:
         expected += np.outer(pull, pull)
@@ -131,7 +131,7 @@ BEFORE_WALL = Registered(np.eye(3), ORIGIN - [3.0, 0, 0], 1.0, 0.0, 0.9, np.eye(
 
 @pytest.fixture(scope="module")
 def wall(scene_of):
-    """Square to x through the map's origin, of no thickness."""
+    """Return a wall perpendicular to x through the map origin, without thickness."""
     surfels = scene_of(((0, -6, -6), (0, 12, 0), (0, 0, 12))).surfels()
     surfels["thickness_m"] = 0
     return SurfelMap.prepare(ORIGIN, surfels, np.array([[0.0, 0.0, 0.0, len(surfels)]]))
@@ -141,7 +141,7 @@ def wall(scene_of):
     ("count", "factor"), [(1, 1.0), (2, 2.0), (8, 8.0), (9, 9.0), (10, 5.0), (12, 3.0), (16, 2.0), (40, 1.25)]
 )
 def test_few_patches_that_eight_unknowns_were_fitted_to_count_for_more(wall, points_at, count, factor):
-    """One point a patch, each known to 0.1 m and 0.1 m off: n patches scatter n times as much as one would, and n / (n - 8)."""
+    """One point per patch with sigma 0.1 m and error 0.1 m: the scatter of n patches is n times that of one, times n / (n - 8)."""
     k = np.arange(count)
     ahead = rays(0.2 * (k % 8) - 0.7, 0.2 * (k // 8) - 0.5)
     points = points_at(ahead * (2.9 / ahead[:, :1]), sigma=0.0)
@@ -166,14 +166,14 @@ def test_without_points_there_is_no_scatter(city, pose, points_at):
 
 @pytest.fixture(scope="module")
 def fan():
-    """1200 rays ahead, 30 x 40 of them, in 6 x 8 patches."""
+    """Return 1200 rays ahead, 30 x 40, in 6 x 8 patches."""
     azimuth, elevation = np.meshgrid(np.linspace(-0.79, 0.79, 40), np.linspace(-0.59, 0.59, 30))
     return rays(azimuth.ravel(), elevation.ravel())
 
 
 @pytest.fixture(scope="module")
 def taken(wall, fan, points_at):
-    """Of the wall, 3 m ahead, with a deviation of 1 cm that each point has of its own, or that the points of a patch share."""
+    """Return points of the wall 3 m ahead. Sigma is 1 cm, independent per point or shared by a patch."""
 
     def made(rng, *, patchwise=False):
         errors = rng.normal(0, 0.01, len(fan))
@@ -185,7 +185,7 @@ def taken(wall, fan, points_at):
 
 @pytest.fixture(scope="module")
 def mean_scatter(wall, taken, fan):
-    """Over many pictures, less the factor for few patches."""
+    """Return the mean scatter of many images, without the factor for few patches."""
 
     def mean(*, patchwise):
         rng = np.random.default_rng(7)
@@ -198,14 +198,14 @@ def mean_scatter(wall, taken, fan):
 
 @pytest.fixture(scope="module")
 def information(wall, taken, start_at):
-    """Of the same points."""
+    """Return the information of the same points."""
     start = start_at(np.eye(3), [-3.0, 0, 0])
     align(wall.grid, wall.surfels, taken(np.random.default_rng(8)), start, replace(PLAIN.fine, iterations=1))
     return start["information"][0]
 
 
 def in_units_of(information, matrix):
-    """So that every unknown's own information is 1."""
+    """Scale the unknowns so that the information of each is 1."""
     known = np.diag(information) > 1e-9 * np.diag(information).max()
     size = np.sqrt(np.diag(information)[known])
     assert known.sum() == 4  # of a wall ahead: how far it is, two turns, the scale
@@ -213,13 +213,13 @@ def in_units_of(information, matrix):
 
 
 def test_of_independent_points_whose_variances_are_right_scatter_is_the_information(mean_scatter, information):
-    """Which is what makes the sandwich the usual covariance again."""
+    """Then the sandwich estimate equals the usual covariance."""
     found, expected = (in_units_of(information, each) for each in (mean_scatter(patchwise=False), information))
     np.testing.assert_allclose(found, expected, atol=0.05)
 
 
 def test_points_that_err_together_scatter_as_often_more_as_a_patch_has_of_them(mean_scatter, information, fan):
-    """25 a patch: however many of them there are, they know no more than one."""
+    """A patch has 25 points with a common error. They carry the information of one point."""
     assert len(fan) / (patches(fan).max() + 1) == 25
     found, expected = (in_units_of(information, each) for each in (mean_scatter(patchwise=True), information))
     np.testing.assert_allclose(np.diag(found), 25 * np.diag(expected), rtol=0.15)
@@ -229,12 +229,12 @@ def test_points_that_err_together_scatter_as_often_more_as_a_patch_has_of_them(m
 def test_disagreement_is_how_many_times_more_the_patches_scatter_than_points_would(
     mean_scatter, information, patchwise, expected
 ):
-    """Of a wall ahead half of the unknowns are told nothing of; they do not count."""
+    """A wall ahead leaves half of the unknowns unobservable. They do not count."""
     assert disagreement(information, mean_scatter(patchwise=patchwise)) == pytest.approx(expected, rel=0.2)
 
 
 def test_disagreement_by_hand_in_any_units():
-    """Two unknowns, one scattering twice as much as it should, one four times: three; the rest is not told."""
+    """Two unknowns scatter two and four times as much as expected, so the mean is three. The others are unobservable."""
     information = np.diag([4.0, 1e-4, 0, 0, 0, 0, 0, 0])
     scatter = np.diag([8.0, 4e-4, 0, 0, 0, 0, 0, 9.0])
     assert disagreement(information, scatter) == pytest.approx(3.0)

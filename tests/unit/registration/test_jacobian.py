@@ -1,4 +1,4 @@
-"""The kernel's derivatives against numerical ones, on surfels so lonely that every point keeps its own."""
+"""The derivatives of the kernel against numerical ones. Surfels are so sparse that each point keeps its own."""
 
 from typing import Any
 
@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from service.registration.kernel import SURFEL, QueryPoints, SolverOptions, align, nearest_grid, pulls
+from service.registration.kernel import SURFEL, QueryPoints, SolverOptions, align, gradients, nearest_grid
 
 UNKNOWNS = ["x", "y", "z", "roll", "pitch", "yaw", "log scale", "disparity offset"]
 FREE: dict[str, Any] = {"reach": 1.0, "robust_first": 1e6, "robust_last": 1e6, "prior_weight": 0.0, "free_offset": True}
 
 
 class Problem:
-    """64 surfels 4 m apart with any normals, one point near each, and the pose, scale and offset that put it there."""
+    """64 surfels 4 m apart with random normals, one point near each, and the pose, scale and offset that place it there."""
 
     def __init__(self, seed, *, off_m=0.0):
         rng = np.random.default_rng(seed)
@@ -34,11 +34,13 @@ class Problem:
         self.points = QueryPoints(
             ((there - self.t) @ self.R / stretch[:, None]).astype(f),
             (rays / np.linalg.norm(rays, axis=1, keepdims=True)).astype(f),
-            rng.uniform(0.01, 0.1, len(cells)).astype(f), rng.uniform(0.5, 2, len(cells)).astype(f), q.astype(f),
-        )  # fmt: skip
+            rng.uniform(0.01, 0.1, len(cells)).astype(f),
+            rng.uniform(0.5, 2, len(cells)).astype(f),
+            q.astype(f),
+        )
 
     def residuals(self, change):
-        """Distance of each point from its surfel's plane after the unknowns changed by so much."""
+        """Return the distance of each point from the plane of its surfel after a change of the unknowns."""
         R = Rotation.from_rotvec(change[3:6]).as_matrix() @ self.R
         stretch = np.exp(self.log_scale + change[6]) / (1 + (self.offset + change[7]) * self.points.q.astype(float))
         there = stretch[:, None] * self.points.xyz.astype(float) @ R.T + self.t + change[:3]
@@ -49,7 +51,7 @@ class Problem:
         return np.stack([(self.residuals(step) - self.residuals(-step)) / 2e-5 for step in steps], axis=1)
 
     def ratios(self):
-        """Range at which the line from the camera through each point meets its surfel's plane, over the point's own."""
+        """Return the range at which the ray through each point hits the plane of its surfel, divided by the range of the point."""
         stretch = np.exp(self.log_scale) / (1 + self.offset * self.points.q.astype(float))
         measured = stretch[:, None] * self.points.xyz.astype(float) @ self.R.T
         normal = self.surfels["normal"].astype(float)
@@ -71,7 +73,7 @@ class Problem:
         return state[0]
 
     def away(self, state):
-        """The unknowns of a state less the true ones."""
+        """Return the unknowns of a state minus the true ones."""
         turn = Rotation.from_matrix(state["R"] @ self.R.T).as_rotvec()
         return np.array(
             [*(state["t"] - self.t), *turn, state["log_scale"] - self.log_scale, state["offset"] - self.offset]
@@ -102,8 +104,8 @@ def test_a_step_is_that_of_gauss_and_newton(start_at, seed):
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_a_patch_pulls_by_its_points_numerical_gradients_residuals_and_weights(start_at, seed):
-    """Six patches of points in no order, and the seventh that none lies in."""
+def test_the_gradient_of_a_patch_equals_the_numerical_one(start_at, seed):
+    """Six patches with points in random order, and a seventh patch without points."""
     problem = Problem(seed, off_m=0.3)
     patch = np.random.default_rng(seed).integers(0, 6, len(problem.surfels)).astype(np.int32)
     patch[5] = 7
@@ -111,7 +113,7 @@ def test_a_patch_pulls_by_its_points_numerical_gradients_residuals_and_weights(s
     expected = np.stack([each[patch == number].sum(axis=0) for number in range(8)])
     state, options = problem.state(start_at), SolverOptions(**FREE, iterations=1, surface=0.05)
     before = state.tobytes()
-    found = pulls(problem.grid, problem.surfels, problem.points, state, options, patch)
+    found = gradients(problem.grid, problem.surfels, problem.points, state, options, patch)
     size = np.abs(each).sum(axis=0)
     np.testing.assert_allclose(found / size, expected / size, atol=1e-5)
     assert (found[6] == 0).all()
@@ -120,12 +122,14 @@ def test_a_patch_pulls_by_its_points_numerical_gradients_residuals_and_weights(s
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_all_pulls_together_are_what_a_step_gives_way_to(start_at, seed):
-    """Of the solver's own information, but for the 0.001 a point that keeps turns from running away."""
+def test_the_sum_of_the_gradients_gives_the_solver_step(start_at, seed):
+    """The step of the solver, with its information and the damping of 0.001 per point on rotations."""
     problem = Problem(seed, off_m=0.05)
     state, options = problem.state(start_at), SolverOptions(**FREE, iterations=1, surface=0.05)
     count = len(problem.surfels)
-    found = pulls(problem.grid, problem.surfels, problem.points, state, options, np.arange(count, dtype=np.int32) % 9)
+    found = gradients(
+        problem.grid, problem.surfels, problem.points, state, options, np.arange(count, dtype=np.int32) % 9
+    )
     moved = problem.aligned(start_at, iterations=1, surface=0.05)
     damping = np.diag([0, 0, 0, *[1e-3 * problem.points.weight.sum()] * 3, 0, 0])
     step = problem.away(moved)
@@ -156,7 +160,7 @@ def test_a_change_of_everything_is_undone_in_a_few_steps(start_at):
 def test_a_point_off_its_surface_informs_the_less_the_narrower_the_robust_width(
     points_at, start_at, robust_m, expected
 ):
-    """0.1 m off, variance 0.1^2: the width's square is 4 x 0.01 and the robust width's square."""
+    """Error 0.1 m and variance 0.1^2: the squared width is 4 x 0.01 plus the square of the robust width."""
     surfels = np.zeros(1, SURFEL)
     surfels["normal"] = [1, 0, 0]
     grid = nearest_grid(surfels, cell_m=0.3, reach_m=1.2)

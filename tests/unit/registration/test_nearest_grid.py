@@ -18,7 +18,7 @@ def surfels_at(xyz):
 
 
 def cells_of(grid):
-    """Centre and surfel of every cell of every block, filled or not; -1 for none."""
+    """Return centre and surfel of every cell of every block, filled or not; -1 for none."""
     size = np.array(grid.block.shape) * BLOCK
     cell = np.stack(np.meshgrid(*(np.arange(n) for n in size), indexing="ij"), axis=-1).reshape(-1, 3)
     block = grid.block[tuple(cell.T // BLOCK)]
@@ -27,9 +27,12 @@ def cells_of(grid):
 
 
 @given(
-    seed=st.integers(0, 10**6), count=st.integers(1, 60), cell_m=st.sampled_from([0.3, 0.4, 0.9]),
-    reach_m=st.sampled_from([0.5, 1.2, 2.0]), extent_m=st.sampled_from([0.0, 1.0, 5.0]),
-)  # fmt: skip
+    seed=st.integers(0, 10**6),
+    count=st.integers(1, 60),
+    cell_m=st.sampled_from([0.3, 0.4, 0.9]),
+    reach_m=st.sampled_from([0.5, 1.2, 2.0]),
+    extent_m=st.sampled_from([0.0, 1.0, 5.0]),
+)
 @settings(max_examples=30)
 def test_every_cell_within_reach_holds_its_nearest_surfel_and_every_other_none(seed, count, cell_m, reach_m, extent_m):
     rng = np.random.default_rng(seed)

@@ -23,7 +23,7 @@ def points_in(depth, settings=ALL, *, height_m=HIGH_M, R=R_BODY_OPTICAL, camera=
 
 
 def tilted_plane(width, height, *, noise=0.0, seed=0):
-    """Inverse depth that is linear in the pixel, about 0.1 1/m, and its noise."""
+    """Return inverse depth that is linear in the pixel, about 0.1 1/m, with noise."""
     v, u = np.mgrid[:height, :width]
     inverse = 0.1 + 0.03 * u / width - 0.02 * v / height
     return (1 / (inverse + np.random.default_rng(seed).normal(0, noise, inverse.shape))).astype(np.float32)
@@ -52,7 +52,7 @@ def test_no_picture_is_free_of_noise(depth):
 
 
 def test_the_least_noise_is_lost_in_the_least_deviation_of_a_point():
-    """So the bound changes no point: at the end of the reach it is a twelfth of it."""
+    """So the bound changes no point: at the largest depth it is a twelfth of the least sigma."""
     settings = PointSettings()
     assert LEAST_NOISE * settings.reach_m**2 < 0.1 * settings.floor_m
 
@@ -65,14 +65,14 @@ def test_holes_and_edges_do_not_change_the_noise():
     assert inverse_depth_noise(depth).total == pytest.approx(1e-3, rel=0.2)
 
 
-def test_too_few_pixels_tell_no_noise_and_a_quarter_of_a_disparity_is_taken():
+def test_with_too_few_pixels_the_noise_is_a_quarter_of_a_pixel():
     depth = np.zeros((240, 320), np.float32)
     depth[:8, :20] = tilted_plane(20, 8, noise=1e-3)
     assert inverse_depth_noise(depth).total == 0.25 / 80
 
 
 def test_every_block_gives_the_point_in_its_middle():
-    """A wall 10 m ahead of 8 x 6 px in blocks of 2: the first one's middle is the pixel (0.5, 0.5)."""
+    """A wall 10 m ahead, 8 x 6 px in blocks of 2. The centre of the first block is the pixel (0.5, 0.5)."""
     camera = PinholeCamera(8, 6, 5.0, 5.0, 3.5, 2.5)
     found = points_in(np.full((6, 8), 10.0), PointSettings(columns=4), camera=camera, focal_baseline_px_m=50.0)
     assert len(found) == 12
@@ -83,7 +83,7 @@ def test_every_block_gives_the_point_in_its_middle():
 
 
 def test_points_stand_in_the_level_frame():
-    """Looking 10 degrees down at a wall square to the axis: the middle of the picture lies 10 m along the axis."""
+    """The camera looks 10 degrees down at a wall perpendicular to its axis. The image centre is 10 m along the axis."""
     R = rotation_y(np.deg2rad(10)) @ R_BODY_OPTICAL
     found = points_in(np.full((5, 5), 10.0), camera=PinholeCamera(5, 5, 3.0, 3.0, 2.0, 2.0), R=R)
     middle = found.xyz[12]
@@ -129,7 +129,7 @@ def test_a_slanted_ray_is_as_uncertain_as_it_is_long():
 
 
 def test_blocks_on_an_edge_are_left_out():
-    """160 x 120 px in blocks of 4; the depth jumps within the 20th column of blocks."""
+    """160 x 120 px in blocks of 4. The depth jumps within the 20th column of blocks."""
     found = points_in(np.where(np.arange(160) < 78, 5.0, 10.0) * np.ones((120, 1)), PointSettings(columns=40))
     assert len(found) == 39 * 30
     assert set(np.round(depths_of(found), 4).tolist()) == {5.0, 10.0}
@@ -149,12 +149,12 @@ def test_an_empty_picture_gives_no_points():
 
 
 @pytest.mark.parametrize(("depth_m", "count"), [(39.9, 4800), (40.1, 0)])
-def test_what_is_beyond_reach_is_left_out(depth_m, count):
+def test_points_beyond_reach_are_left_out(depth_m, count):
     assert len(points_in(np.full((60, 80), depth_m))) == count
 
 
 def over_a_road(height_m=1.5, wall_m=20.0):
-    """A wall across the road."""
+    """Return a wall across the road."""
     down = np.maximum(camera_of(80, 60).rays_of_pixels()[..., 1], 1e-6)
     return np.minimum(height_m / down, wall_m)
 
@@ -187,11 +187,14 @@ def test_the_points_are_spread_over_the_whole_picture():
 
 
 @given(
-    seed=st.integers(0, 10**6), most=st.integers(1, 3000), ground_share=st.floats(0, 0.95), height_m=st.floats(0.5, 3),
+    seed=st.integers(0, 10**6),
+    most=st.integers(1, 3000),
+    ground_share=st.floats(0, 0.95),
+    height_m=st.floats(0.5, 3),
     known=st.floats(0, 1),
-)  # fmt: skip
+)
 @settings(max_examples=40)
-def test_there_are_never_more_points_than_wanted_and_no_two_alike(seed, most, ground_share, height_m, known):
+def test_there_are_never_more_points_than_wanted_and_no_duplicates(seed, most, ground_share, height_m, known):
     rng = np.random.default_rng(seed)
     depth = np.where(rng.uniform(size=(60, 80)) < known, over_a_road(height_m, rng.uniform(2, 50)), 0)
     found = points_in(depth, PointSettings(points=most, ground_share=ground_share), height_m=height_m)
@@ -199,8 +202,8 @@ def test_there_are_never_more_points_than_wanted_and_no_two_alike(seed, most, gr
     assert len(np.unique(found.ray, axis=0)) == len(found)
 
 
-def test_what_may_drive_away_weighs_less():
-    """Of a wall, what is between 0.3 and 2 m above the ground; the ground itself and what is higher weigh full."""
+def test_movable_points_have_less_weight():
+    """Points of the wall between 0.3 and 2 m above the ground have less weight. Ground and higher points have full weight."""
     found = points_in(over_a_road(wall_m=8.0), height_m=1.5)
     above_m = found.xyz[:, 2] + 1.5
     movable = (above_m > 0.3) & (above_m < 2.0)
@@ -213,8 +216,11 @@ def test_depth_of_another_size_and_the_same_aspect_gives_the_same_points(factor)
     small = np.where(np.arange(80) < 33, 5.0, 12.0) * np.ones((60, 1))
     large = small.repeat(factor, axis=0).repeat(factor, axis=1)
     expected = points_in(small, camera=camera_of(80, 60), height_m=1.5)
-    for depth, camera in ((large, camera_of(80, 60)), (large, camera_of(80 * factor, 60 * factor)),
-                          (small, camera_of(80 * factor, 60 * factor))):  # fmt: skip
+    for depth, camera in (
+        (large, camera_of(80, 60)),
+        (large, camera_of(80 * factor, 60 * factor)),
+        (small, camera_of(80 * factor, 60 * factor)),
+    ):
         found = points_in(depth, camera=camera.scaled_to(camera.width, camera.height), height_m=1.5)
         for name in ("xyz", "ray", "sigma", "weight", "q"):
             np.testing.assert_allclose(
@@ -223,7 +229,7 @@ def test_depth_of_another_size_and_the_same_aspect_gives_the_same_points(factor)
 
 
 def test_the_noise_may_be_given_and_is_then_not_read_off_the_picture():
-    """A faultless wall 10 m ahead, told to be noisy: 10^2 * 1e-3 m along the straight ray."""
+    """An exact wall 10 m ahead with a given noise: 10^2 * 1e-3 m along the central ray."""
     depth = np.full((60, 80), 10.0)
     found = points_in(depth, replace(ALL, floor_m=0.0), noise=1e-3)
     straight = np.argmax(found.ray @ R_BODY_OPTICAL[:, 2])
@@ -232,7 +238,7 @@ def test_the_noise_may_be_given_and_is_then_not_read_off_the_picture():
 
 
 def plain_blocks(depth_m, wanted, noise):
-    """Depth of each block, 0 where it gives none, as NumPy says it."""
+    """Return the depth of each block computed in NumPy, 0 for none."""
     height, width = depth_m.shape
     size = max(1, width // wanted.columns)
     rows, columns, skip = height // size, width // size, max(1, size // 4)
@@ -251,8 +257,11 @@ def plain_blocks(depth_m, wanted, noise):
 
 @settings(max_examples=30, deadline=None)
 @given(
-    seed=st.integers(0, 2**32 - 1), holes=st.floats(0, 1), spread=st.floats(0, 0.2), columns=st.sampled_from([10, 13, 22, 46, 70, 999]),
-)  # fmt: skip
+    seed=st.integers(0, 2**32 - 1),
+    holes=st.floats(0, 1),
+    spread=st.floats(0, 0.2),
+    columns=st.sampled_from([10, 13, 22, 46, 70, 999]),
+)
 def test_the_compiled_blocks_are_those_of_plain_numpy(seed, holes, spread, columns):
     rng = np.random.default_rng(seed)
     depth_m = (rng.uniform(1, 45, (61, 1)) * rng.normal(1, spread, (61, 160)).clip(0.1)).astype(np.float32)
@@ -275,7 +284,7 @@ def test_noise_is_read_as_plain_numpy_reads_it():
 
 
 def test_errors_that_neighbours_share_count_as_noise():
-    """Matching smooths over its window: what pixels 2 apart share is seen between pixels 8 apart."""
+    """Matching smooths over its window. Pixels 8 apart show the error that pixels 2 apart share."""
     rng, size = np.random.default_rng(5), 9
     own = rng.normal(0, 1, (240, 320 + size - 1))
     shared = 2e-3 * np.apply_along_axis(np.convolve, 1, own, np.full(size, size**-0.5), mode="valid")
@@ -286,7 +295,7 @@ def test_errors_that_neighbours_share_count_as_noise():
 
 
 def test_a_stereo_rigs_noise_is_that_of_matching_at_least():
-    """Half a pixel of 80 px m is 1 / 160 in inverse depth; independent errors add as squares."""
+    """Half a pixel at 80 px m is 1 / 160 in inverse depth. Independent errors add in quadrature."""
     floor = 0.5 / 80
     assert inverse_depth_noise(tilted_plane(320, 240), focal_baseline_px_m=80.0).total == pytest.approx(floor, rel=1e-5)
     noisy = tilted_plane(320, 240, noise=floor)

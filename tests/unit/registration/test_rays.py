@@ -28,7 +28,7 @@ def adjust(cloud, pictures, found, of):
 
 @pytest.fixture(scope="module")
 def city(street):
-    """The street told from another origin than its own."""
+    """Return the street as a map with another origin."""
     surfels = street.surfels()
     return SurfelMap.prepare(ORIGIN, surfels, np.array([[9.0, 0.0, 0.0, len(surfels)]]))
 
@@ -36,7 +36,7 @@ def city(street):
 def picture_of(
     street, pose, *, noise=0.0, scale=1.0, offset=0.0, rig=80.0, seed=1, R_level_camera=R_LEVEL_CAMERA, aside_m=0.0
 ):
-    """Inverse depths as a camera of this scale, offset and noise measures them, ``aside_m`` to the left of the reference."""
+    """Return inverse depths of a camera with a scale, an offset and noise, ``aside_m`` to the left of the reference."""
     R, t = pose
     T_level_camera = transform_from(R_level_camera, np.array([0.0, aside_m, 0.0]))
     z = street.depth(CAMERA, transform_from(R, t) @ T_level_camera).astype(float)
@@ -56,7 +56,7 @@ def found_at(pose, *, away=(0.0, 0.0, 0.0), turned=(0.0, 0.0, 0.0)):
     st.tuples(*[st.floats(-0.01, 0.01)] * 2, st.floats(-0.03, 0.03)),
 )
 @settings(max_examples=25)
-def test_a_faultless_picture_is_put_where_it_was_taken(city, street, pose, away, turned):
+def test_an_exact_image_is_registered_at_its_true_pose(city, street, pose, away, turned):
     many = replace(SETTINGS, rounds=6, steps=3)
     got, _ = adjust(city, [picture_of(street, pose)], found_at(pose, away=away, turned=turned), many)
     assert np.linalg.norm(got.camera_m - ORIGIN - pose[1]) < 0.02
@@ -67,17 +67,17 @@ def test_a_faultless_picture_is_put_where_it_was_taken(city, street, pose, away,
     assert got.converged
 
 
-def test_what_a_scorer_has_looked_up_already_is_not_looked_up_again(city, street, pose, monkeypatch):
+def test_rays_that_a_scorer_has_cast_are_not_cast_again(city, street, pose, monkeypatch):
     pictures, start = [picture_of(street, pose)], found_at(pose, away=(0.1, 0.05, 0))
-    sights, asked, kept = SurfelRaycaster(city, SETTINGS), [], SurfelRaycaster._look_up
-    rays.met_by(sights, pictures, start)
-    monkeypatch.setattr(SurfelRaycaster, "_look_up", lambda *given: (asked.append(given), kept(*given))[1])
-    rays.adjust(sights, pictures, start, replace(SETTINGS, rounds=1))
+    raycaster, asked, kept = SurfelRaycaster(city, SETTINGS), [], SurfelRaycaster._cast
+    rays.cast_rays(raycaster, pictures, start)
+    monkeypatch.setattr(SurfelRaycaster, "_cast", lambda *given: (asked.append(given), kept(*given))[1])
+    rays.adjust(raycaster, pictures, start, replace(SETTINGS, rounds=1))
     assert asked == []
 
 
 @pytest.mark.parametrize(
-    ("away", "still_m", "rounds", "looked_up"),
+    ("away", "converged_m", "rounds", "looked_up"),
     [
         (0.0, 0.02, 5, (1, 1)),
         (0.1, 0.02, 9, (2, 8)),
@@ -87,16 +87,16 @@ def test_what_a_scorer_has_looked_up_already_is_not_looked_up_again(city, street
     ],
 )
 def test_rays_are_looked_up_until_the_pose_stands_still(
-    city, street, pose, monkeypatch, away, still_m, rounds, looked_up
+    city, street, pose, monkeypatch, away, converged_m, rounds, looked_up
 ):
-    asked, kept = [], SurfelRaycaster._look_up
-    monkeypatch.setattr(SurfelRaycaster, "_look_up", lambda *given: (asked.append(given), kept(*given))[1])
-    s = replace(SETTINGS, rounds=rounds, still_m=still_m, still_rad=1e9)
+    asked, kept = [], SurfelRaycaster._cast
+    monkeypatch.setattr(SurfelRaycaster, "_cast", lambda *given: (asked.append(given), kept(*given))[1])
+    s = replace(SETTINGS, rounds=rounds, converged_m=converged_m, converged_rad=1e9)
     adjust(city, [picture_of(street, pose)], found_at(pose, away=(away, 0, 0)), s)
     assert looked_up[0] <= len(asked) <= looked_up[1]
 
 
-def test_what_was_found_before_stays_as_it_is(city, street, pose):
+def test_the_given_pose_stays_unchanged(city, street, pose):
     start = found_at(pose, away=(0.2, 0.1, 0))
     before = start.camera_m.copy(), start.R_map_level.copy()
     adjust(city, [picture_of(street, pose)], start, SETTINGS)
@@ -120,7 +120,7 @@ def test_a_camera_that_is_no_rig_has_no_offset(city, street, pose):
 
 
 def test_a_common_error_of_patches_is_not_the_pose_s(city, street, pose):
-    """Every other patch on the left is off by several pixels' noise, all one way: counted pixel by pixel, that pulls further."""
+    """Every second patch on the left has the same error of several sigmas. Without shared errors, its effect is larger."""
     picture = picture_of(street, pose, rig=None)
     wrong = picture.inverse.copy()
     for row in range(0, 48, 12):
@@ -136,7 +136,7 @@ def test_a_common_error_of_patches_is_not_the_pose_s(city, street, pose):
 
 
 def test_two_cameras_of_one_rig_are_one_picture(city, street, pose):
-    """One looks back: what it sees holds the street's length, and both are said in the reference's frame."""
+    """One camera looks back and constrains the position along the street. Both are in the frame of the reference."""
     back = rotation_z(np.pi) @ R_LEVEL_CAMERA
     pictures = [picture_of(street, pose), picture_of(street, pose, R_level_camera=back, aside_m=0.3, rig=80.0)]
     many = replace(SETTINGS, rounds=6, steps=3)
@@ -144,8 +144,8 @@ def test_two_cameras_of_one_rig_are_one_picture(city, street, pose):
     assert np.linalg.norm(got.camera_m - ORIGIN - pose[1]) < 0.02
 
 
-def test_cars_that_stand_elsewhere_now_pull_less_where_they_are_known_to_be_cars():
-    """Half of what is seen stands 0.3 m nearer than mapped, too little for the robust kernel."""
+def test_moved_cars_have_less_effect_where_points_are_marked_movable():
+    """Half of the pixels are 0.3 m nearer than mapped, too little for the robust kernel."""
     inverse = np.full((CAMERA.height, CAMERA.width), 0.1, np.float32)
     inverse[:, :32] = 1 / 9.7
     movable = np.zeros(inverse.shape, bool)
@@ -166,7 +166,7 @@ def test_cars_that_stand_elsewhere_now_pull_less_where_they_are_known_to_be_cars
     assert off["known"] == pytest.approx(0.0, abs=0.03)
 
 
-def test_a_picture_that_meets_too_little_adjusts_nothing(city, street, pose):
+def test_an_image_with_too_few_intersections_is_not_adjusted(city, street, pose):
     picture = picture_of(street, pose)
     few = np.zeros_like(picture.inverse)
     few[20:29, 20:30] = picture.inverse[20:29, 20:30]
@@ -174,11 +174,11 @@ def test_a_picture_that_meets_too_little_adjusts_nothing(city, street, pose):
     assert adjust(city, [picture], found_at(pose, away=(500.0, 0, 0)), SETTINGS) is None
 
 
-def plain(city, picture, met, R, t, *, scale, offset, s):
-    """Residual, gradient by finite differences, weight and patch of every pixel that counts."""
-    v, u = np.nonzero((met >= 0) & (picture.inverse > 0))
+def plain(city, picture, hits, R, t, *, scale, offset, s):
+    """Compute residual, gradient by finite differences, weight and patch of every valid pixel."""
+    v, u = np.nonzero((hits >= 0) & (picture.inverse > 0))
     ray = CAMERA.rays_of_pixels()[v, u]
-    surfels = city.surfels[met[v, u]]
+    surfels = city.surfels[hits[v, u]]
     n, x = surfels["normal"].astype(float), surfels["xyz"].astype(float)
 
     def predicted(change):
@@ -208,7 +208,7 @@ def plain(city, picture, met, R, t, *, scale, offset, s):
 def test_the_normal_equations_are_those_with_one_more_unknown_for_every_patch(
     city, street, pose, seed, shared, moved, patch, again
 ):
-    """Solved whole by plain linear algebra, patches' errors among the unknowns; and added to what was there before."""
+    """The reference solves a dense system that includes the shared errors of the patches. Sums of earlier images are kept."""
     rng = np.random.default_rng(seed)
     s = replace(SETTINGS, shared=shared, moved_m=moved, patch=patch, radius_m=0.3)
     R, t = Rotation.from_rotvec(rng.normal(0, 0.01, 3)).as_matrix() @ pose[0], pose[1] + rng.normal(0, 0.1, 3)
@@ -217,11 +217,11 @@ def test_the_normal_equations_are_those_with_one_more_unknown_for_every_patch(
     picture = replace(picture_of(street, pose, noise=2e-3, seed=seed), movable=movable)
     pictures = [picture] * (2 if again else 1)
     state = rays._State(R, t, float(np.log(scale)), float(offset))
-    met = [SurfelRaycaster(city, s).meet(state.camera_of(picture), CAMERA)] * len(pictures)
-    got = rays._pull(city, pictures, met, state, s, scattered=True)
-    J, r, w, patches = plain(city, picture, met[0], R, t, scale=scale, offset=offset, s=s)
+    hits = [SurfelRaycaster(city, s).intersect(state.camera_of(picture), CAMERA)] * len(pictures)
+    got = rays._normal_equations(city, pictures, hits, state, s, with_scatter=True)
+    J, r, w, patches = plain(city, picture, hits[0], R, t, scale=scale, offset=offset, s=s)
     H, b, error = J.T @ (J * w[:, None]), J.T @ (w * r), 0.5 * (w @ r**2)
-    shift = np.where(movable, moved * picture.inverse.astype(float) ** 2, 0)[(met[0] >= 0) & (picture.inverse > 0)]
+    shift = np.where(movable, moved * picture.inverse.astype(float) ** 2, 0)[(hits[0] >= 0) & (picture.inverse > 0)]
     for own in np.unique(patches[w > 0]):
         of = (patches == own) & (w > 0)
         common = (shared * picture.noise) ** 2 + (shift[of] ** 2).mean()
@@ -237,18 +237,18 @@ def test_the_normal_equations_are_those_with_one_more_unknown_for_every_patch(
 
 
 def test_neighbouring_patches_scatter_as_one():
-    """Two by two; what pulls one way in one and the other way in the next cancels, and unequal sides lose nothing."""
-    pulls = np.zeros((3, 5, 8))
-    pulls[0, 0, 0], pulls[0, 1, 0] = 2.0, -2.0
-    assert not rays._scattered(pulls).any()
-    pulls[2, 4, 1] = 3.0
-    np.testing.assert_allclose(rays._scattered(pulls), np.diag([0, 9.0, 0, 0, 0, 0, 0, 0]))
+    """Patches are joined two by two. Opposite gradients of neighbours cancel, and odd sizes lose no patch."""
+    gradients = np.zeros((3, 5, 8))
+    gradients[0, 0, 0], gradients[0, 1, 0] = 2.0, -2.0
+    assert not rays._scatter_of(gradients).any()
+    gradients[2, 4, 1] = 3.0
+    np.testing.assert_allclose(rays._scatter_of(gradients), np.diag([0, 9.0, 0, 0, 0, 0, 0, 0]))
 
 
 @given(st.tuples(*[st.floats(-3, 3)] * 3), st.sampled_from([1.0, 1e-3, 1e-6, 0.0]))
 def test_a_turn_is_that_of_its_vector(vector, size):
     turn = size * np.array(vector)
-    np.testing.assert_allclose(rays._turned_by(turn), Rotation.from_rotvec(turn).as_matrix(), atol=1e-12)
+    np.testing.assert_allclose(rays._rotation_of(turn), Rotation.from_rotvec(turn).as_matrix(), atol=1e-12)
 
 
 @pytest.mark.parametrize("patch", [0, -1, 17])

@@ -26,7 +26,7 @@ def surveyed(street):
 
 
 def measured(points, *, seed=2):
-    """With noise along the ray as ``sigma`` says."""
+    """Return the points with noise along the ray as ``sigma`` states."""
     noise = np.random.default_rng(seed).normal(0, points.sigma).astype(np.float32)
     return replace(points, xyz=points.xyz + noise[:, None] * points.ray)
 
@@ -72,7 +72,7 @@ def test_the_best_supported_start_comes_first_and_says_whose_it_was(surveyed, se
 
 @pytest.fixture(scope="module")
 def two_streets(scene_of, streets_at):
-    """The street twice, 40 m apart."""
+    """Return the street twice, 40 m apart."""
     return scene_of(*streets_at(-6.0, 0.0), *streets_at(-6.0, 40.0)).survey()
 
 
@@ -86,7 +86,7 @@ def test_every_candidate_keeps_the_number_of_its_hypothesis(two_streets, seen, p
 
 
 def test_the_starts_that_are_refined_stand_apart_and_are_few(surveyed, seen, pose: Pair):
-    """Without further iterations the candidates lie where they were picked, and a single coarse one leaves them spread."""
+    """Without further iterations the candidates stay where they were chosen. One coarse iteration leaves them spread."""
     few = SolverOptions(iterations=1, reach=1.2, robust_first=0.8, robust_last=0.3, surface=0.1)
     starts = [start(*pose, k, moved_m=(0.9 * k, 0.2 * k, 0.0)) for k in range(6)]
     for refined, apart_m in ((3, 0.5), (4, 1.0), (1, 0.5)):
@@ -99,7 +99,7 @@ def test_the_starts_that_are_refined_stand_apart_and_are_few(surveyed, seen, pos
 
 
 def test_starts_are_offset_along_and_across_their_heading(surveyed, seen, pose):
-    """Nothing moves: the candidates are the offset starts themselves."""
+    """Without iterations, the candidates are the offset starts themselves."""
     offsets = ((0.0, 0.0), (2.0, 0.0), (0.0, 1.0))
     settings = RegistrationSettings(**NOTHING_MOVES, offsets_m=offsets, kept_of_each=(3, 3))
     left = Start(rotation_z(np.pi / 2), pose[1], 0)
@@ -110,11 +110,15 @@ def test_starts_are_offset_along_and_across_their_heading(surveyed, seen, pose):
 
 @pytest.mark.parametrize(("most_starts", "turns_deg"), [(6, [0, 10, -10]), (5, [0])])
 def test_starts_are_turned_too_where_they_do_not_become_too_many(surveyed, seen, pose, most_starts, turns_deg):
-    """Two offsets in three turns are six. A turn is about the level frame's own z axis, on a slope too."""
+    """Two offsets and three yaws make six. The yaw is about the z axis of the level frame, also on a slope."""
     settings = RegistrationSettings(
-        **NOTHING_MOVES | {"turns_rad": tuple(np.deg2rad([10, -10]))}, most_starts=most_starts, offsets_m=((0.0, 0.0), (2.0, 0.0)),
-        kept_of_each=(9, 9), refined=9, apart_m=0.0,
-    )  # fmt: skip
+        **NOTHING_MOVES | {"turns_rad": tuple(np.deg2rad([10, -10]))},
+        most_starts=most_starts,
+        offsets_m=((0.0, 0.0), (2.0, 0.0)),
+        kept_of_each=(9, 9),
+        refined=9,
+        apart_m=0.0,
+    )
     leaning = Start(pose[0] @ rotation_y(0.2), pose[1], 0)
     found = register(surveyed, seen, [leaning], HEIGHT_M, settings)
     turned = [leaning.R_map_level.T @ each.R_map_level for each in found]
@@ -128,13 +132,18 @@ def test_starts_are_turned_too_where_they_do_not_become_too_many(surveyed, seen,
 
 @pytest.mark.parametrize(
     ("options", "kept"),
-    [({"kept": 4, "kept_of_each": (1, 5)}, 2), ({"kept": 5, "kept_of_each": (1, 5)}, 2), ({"kept": 6, "kept_of_each": (1, 5)}, 3),
-     ({"kept": 2, "kept_of_each": (2, 5)}, 2), ({"kept": 40, "kept_of_each": (1, 4)}, 4)],
-)  # fmt: skip
+    [
+        ({"kept": 4, "kept_of_each": (1, 5)}, 2),
+        ({"kept": 5, "kept_of_each": (1, 5)}, 2),
+        ({"kept": 6, "kept_of_each": (1, 5)}, 3),
+        ({"kept": 2, "kept_of_each": (2, 5)}, 2),
+        ({"kept": 40, "kept_of_each": (1, 4)}, 4),
+    ],
+)
 def test_so_many_starts_of_each_hypothesis_go_on_however_badly_another_fares(
     two_streets, seen, pose: Pair, options, kept
 ):
-    """Nothing moves. Hypothesis 4 stands in the street, 9 in a field, where nothing is on the map."""
+    """Without iterations. Hypothesis 4 is in the street, 9 in a field without map surfaces."""
     starts = [start(*pose, 4), start(*pose, 9, moved_m=(500.0, 0.0, 0.0))]
     settings = RegistrationSettings(**NOTHING_MOVES, **options, refined=20)
     found = register(two_streets, seen, starts, HEIGHT_M, settings)
@@ -152,8 +161,8 @@ def test_the_starts_of_one_hypothesis_that_go_on_stand_apart(surveyed, seen, pos
     assert away == [0, 2]
 
 
-def test_hypotheses_that_meet_are_refined_once(surveyed, seen, pose: Pair):
-    """Two starts a metre apart both come to the true pose; one of them is carried to the end."""
+def test_converging_hypotheses_are_refined_once(surveyed, seen, pose: Pair):
+    """Two starts a metre apart converge to the true pose. Only one of them goes on to the last stage."""
     starts = [start(*pose, 0, moved_m=(0.5, 0.0, 0.0)), start(*pose, 1, moved_m=(-0.5, 0.0, 0.0))]
     settings = RegistrationSettings(offsets_m=((0.0, 0.0),), refined=4)
     found = register(surveyed, seen, starts, HEIGHT_M, settings)
@@ -166,7 +175,7 @@ def test_hypotheses_that_meet_are_refined_once(surveyed, seen, pose: Pair):
 def test_the_similarity_that_a_start_had_helps_to_choose_which_go_to_the_end(
     two_streets, seen, pose: Pair, weight, true_goes_on, true, beside
 ):
-    """Nothing moves. One stands where the query was taken; the other, 2.5 m beside, fits worse and is 0.5 more similar."""
+    """Without iterations. One start is at the true pose. The other, 2.5 m beside, fits worse and has 0.5 more similarity."""
     starts = [
         replace(start(*pose, true), similarity=0.4),
         replace(start(*pose, beside, moved_m=(0.0, 2.5, 0.0)), similarity=0.9),
@@ -177,7 +186,7 @@ def test_the_similarity_that_a_start_had_helps_to_choose_which_go_to_the_end(
 
 
 def test_the_middle_stage_moves_the_starts_by_its_own_options_and_points(surveyed, seen, pose: Pair, start_at):
-    """With nothing else moving, the candidate lies where the solver leaves the start on every so manyth point."""
+    """Only this stage iterates. The candidate is where the solver ends with every n-th point."""
     options = SolverOptions(iterations=4, reach=1.2, robust_first=0.6, robust_last=0.1)
     settings = RegistrationSettings(
         **NOTHING_MOVES | {"middle": options}, offsets_m=((0.0, 0.0),), middle_points=101, coarse_points=7
@@ -195,7 +204,7 @@ def test_the_middle_stage_moves_the_starts_by_its_own_options_and_points(surveye
 def test_the_fine_stage_lets_no_point_weigh_too_little_but_the_score_is_by_their_own_weights(
     surveyed, seen, pose: Pair, start_at
 ):
-    """Nothing else moves. Every third point is trusted with a tenth only, until the end, when it weighs 0.7."""
+    """Only this stage iterates. Every third point has a weight of 0.1, and 0.7 in the last stage."""
     options = SolverOptions(iterations=5, reach=1.2, robust_first=0.6, robust_last=0.1)
     settings = RegistrationSettings(
         **NOTHING_MOVES | {"fine": options}, offsets_m=((0.0, 0.0),), fine_weight=0.7, tolerance_m=0.12
@@ -258,7 +267,7 @@ def test_a_leaning_start_is_set_upright_on_its_walls(surveyed, seen, pose):
 
 
 def test_a_pose_of_another_frame_follows_from_that_of_the_reference():
-    """The other level frame stands 2 m ahead of the reference and is turned by 90 degrees."""
+    """The other level frame is 2 m ahead of the reference and rotated by 90 degrees."""
     pose = Registered(
         rotation_z(np.pi / 2), np.array([10.0, 5.0, 1.5]), 1.0, 0.0, 0.5, np.eye(8), 3, converged=True, iterations=8
     )

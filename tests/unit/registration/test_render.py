@@ -10,7 +10,7 @@ AHEAD = transform_from(R_BODY_OPTICAL, np.zeros(3))
 
 
 def wall(x, *, y=(-20, 20), z=(-20, 20), step=0.1):
-    """Surfels every ``step`` metres on a wall ``x`` metres ahead."""
+    """Return surfels every ``step`` metres on a wall ``x`` metres ahead."""
     ys, zs = (np.arange(low + step / 2, high, step) for low, high in (y, z))
     grid = np.stack(np.meshgrid([float(x)], ys, zs, indexing="ij"), axis=-1).reshape(-1, 3)
     surfels = np.zeros(len(grid), SURFEL)
@@ -29,7 +29,7 @@ def test_a_wall_that_fills_the_view_stands_at_its_distance_in_every_pixel():
 
 
 def test_a_part_of_a_wall_is_drawn_in_its_pixels_alone():
-    """At 10 m a metre is 2 px; y in 0..4 m is u in 7.5..15.5, z in 1..3 m is v in 5.5..9.5; 0.02 m stand over."""
+    """At 10 m, a metre is 2 px: y in 0..4 m is u in 7.5..15.5, z in 1..3 m is v in 5.5..9.5. Surfels extend 0.02 m."""
     found = drawn(wall(10, y=(0, 4), z=(1, 3), step=0.2))
     expected = np.zeros((24, 32))
     expected[6:10, 8:16] = 10
@@ -37,7 +37,7 @@ def test_a_part_of_a_wall_is_drawn_in_its_pixels_alone():
 
 
 def test_a_turned_and_moved_camera_sees_the_wall_from_where_it_stands():
-    """From (4, 3) looking along y, a wall of x = 10 lies 6 m to the right: u - cx = 20 * 6 / depth."""
+    """From (4, 3) with the view along y, a wall at x = 10 is 6 m to the right: u - cx = 20 * 6 / depth."""
     T = transform_from(rotation_z(np.pi / 2) @ R_BODY_OPTICAL, np.array([4.0, 3.0, 0.0]))
     found = drawn(wall(10, y=(2, 18), z=(-3, 3), step=0.05), T=T)
     row = found[11]
@@ -45,7 +45,7 @@ def test_a_turned_and_moved_camera_sees_the_wall_from_where_it_stands():
     np.testing.assert_allclose(row[25:], 6 * 20 / (np.arange(25, 32) - 15.5), rtol=0.05)
 
 
-def test_what_is_nearer_hides_what_is_farther_in_any_order():
+def test_near_surfaces_hide_far_ones_in_any_order():
     far, pole = wall(10), wall(5, y=(-0.4, 0.4))
     for found in (drawn(far, pole), drawn(pole, far)):
         np.testing.assert_allclose(found[:, 14:18], 5, rtol=1e-6)
@@ -63,7 +63,7 @@ def test_nothing_is_drawn_before_half_a_metre_or_beyond_reach(x, is_drawn):
 
 
 def test_surfels_grow_in_the_picture_as_they_come_near():
-    """0.12 m at 1 m are 2.4 px, at 4 m 0.6 px; in the middle between four pixels that is four of them, and none."""
+    """0.12 m are 2.4 px at 1 m and 0.6 px at 4 m. Between four pixels that covers four of them, and none."""
     one = wall(1, y=(-0.05, 0.05), z=(-0.05, 0.05))
     assert len(one) == 1
     assert (drawn(one) > 0).sum() == 4
@@ -71,7 +71,7 @@ def test_surfels_grow_in_the_picture_as_they_come_near():
 
 
 def test_tiles_beyond_reach_are_left_out():
-    """40 m and 0.71 of a tile's 10 m: a tile is looked at where its centre is nearer than 47.1 m."""
+    """40 m plus 0.71 of a tile's 10 m: tiles with a centre nearer than 47.1 m are rendered."""
     assert (drawn(wall(10), centre=(47.0, 0.0)) > 0).all()
     assert not drawn(wall(10), centre=(47.2, 0.0)).any()
     assert not drawn(wall(10), centre=(0.0, -47.2)).any()

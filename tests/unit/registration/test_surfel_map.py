@@ -11,7 +11,7 @@ NAMES = [*REQUIRED, "brightness"]
 
 @pytest.fixture(scope="module")
 def cloud(scene_of):
-    """Two floors in two tiles, 50 m apart."""
+    """Return two floors in two tiles, 50 m apart."""
     surfels = scene_of(((0, 0, 0), (3, 0, 0), (0, 3, 0)), ((50, 0, 0), (3, 0, 0), (0, 3, 0))).surfels()
     half = len(surfels) // 2
     tiles = np.array([[20.0, 20, 0, half], [60, 20, half, half]])
@@ -22,7 +22,7 @@ def cloud(scene_of):
 
 @pytest.fixture
 def arrays(cloud):
-    """To damage."""
+    """Return valid arrays that a test then damages."""
     return {name: array.copy() for name, array in cloud.arrays().items()}
 
 
@@ -32,7 +32,7 @@ def refused(arrays, name, what):
     assert error.value.field == f"cloud/{name}.npy"
 
 
-def test_what_is_written_is_read_again(cloud):
+def test_written_values_are_read_again(cloud):
     found = SurfelMap.from_arrays(cloud.arrays()).arrays()
     assert sorted(found) == sorted(cloud.arrays()) == sorted(NAMES)
     for name, array in cloud.arrays().items():
@@ -57,11 +57,11 @@ def test_memory_mapped_arrays_register_like_those_in_memory(cloud, tmp_path, poi
 
 @pytest.mark.parametrize(("above_m", "seen"), [(1.0, 1), (1.6, 0), (-1.0, 1), (-1.6, 0)])
 def test_the_grid_reaches_12_decimetres_from_a_surface(cloud, points_at, start_at, above_m, seen):
-    """A cell of 0.4 m is in or out by its centre: 1.2 m, give or take half a cell."""
+    """A cell of 0.4 m is inside or outside by its centre: 1.2 m, plus or minus half a cell."""
     once = SolverOptions(iterations=1, reach=5.0, robust_first=1.0, robust_last=1.0)
     state = start_at(np.eye(3), [1.5, 1.5, above_m - 1.0])
     align(cloud.grid, cloud.surfels, points_at([[0, 0, 1.0]]), state, once)
-    assert state["seen"][0] == seen
+    assert state["matched"][0] == seen
 
 
 @pytest.mark.parametrize("name", REQUIRED)
@@ -139,7 +139,7 @@ def test_other_numbers_that_are_none_are_refused(arrays, name, field):
         SurfelMap.from_arrays(arrays)
 
 
-def test_who_trusts_the_files_may_skip_the_look_at_every_index(arrays):
+def test_the_check_of_every_index_can_be_skipped(arrays):
     arrays["grid_nearest"][0, 0] = 10**6
     assert SurfelMap.from_arrays(arrays, verify=False).grid.nearest[0, 0] == 10**6
     with pytest.raises(BundleError):
@@ -165,11 +165,12 @@ def test_a_map_of_an_earlier_release_has_no_brightness(arrays):
 @pytest.mark.parametrize(
     ("damage", "what"),
     [
-        (lambda b: b[:-1], "float32 of shape"), (lambda b: b.astype(np.float64), "float64 of shape"),
+        (lambda b: b[:-1], "float32 of shape"),
+        (lambda b: b.astype(np.float64), "float64 of shape"),
         (lambda b: np.where(np.arange(len(b)) == 5, np.float32(-1), b), "a brightness is negative or infinite"),
         (lambda b: np.where(np.arange(len(b)) == 5, np.float32(np.inf), b), "a brightness is negative or infinite"),
     ],
-)  # fmt: skip
+)
 def test_a_brightness_that_is_none_is_refused(arrays, damage, what):
     arrays["brightness"] = damage(arrays["brightness"])
     refused(arrays, "brightness", what)

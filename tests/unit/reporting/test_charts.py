@@ -1,4 +1,4 @@
-"""Numbers as drawings."""
+"""Charts from numbers."""
 
 import base64
 import re
@@ -23,7 +23,7 @@ SVG = "{http://www.w3.org/2000/svg}"
 
 
 def svg_of(drawn: str) -> ElementTree.Element:
-    """The drawing inside an image of a page."""
+    """Return the SVG inside an image of a page."""
     content = re.fullmatch(r'<img class="plot" src="data:image/svg\+xml;base64,([^"]+)" alt="[^"]+">', drawn)
     assert content is not None
     return ElementTree.fromstring(base64.b64decode(content[1]))  # noqa: S314 - we wrote it
@@ -75,18 +75,18 @@ def test_a_histogram_without_answers_is_drawn(answers_of):
     assert "queries" in texts_of(svg_of(drawn))
 
 
-def test_each_set_has_its_number_and_words_tell_its_share():
+def test_each_set_has_its_count_and_its_share_in_words():
     drawn = side_by_side({"rain & fog": (1.0, 0.9, 1.0 - 1e-12), "sun": (0.5, 0.4, 0.6)}, "within 1 m")
     assert "rain &amp; fog 100.0% (90.0% to 100.0%); sun 50.0% (40.0% to 60.0%)" in drawn
     assert texts_of(svg_of(drawn))[:2] == ["1", "2"]
 
 
-def test_words_tell_the_shares_within_distances(answers_of):
+def test_the_shares_within_distances_are_in_words(answers_of):
     drawn = error_curve({"all": answers_of([[0, 0]] * 4, [[0.2, 0], [0.8, 0], [3, 0], [np.nan, np.nan]])})
     assert "25.0% within 0.5 m; 50.0% within 1 m; 75.0% within 5 m" in drawn
 
 
-def test_recall_is_told_at_one_five_and_ten_places(answers_of):
+def test_recall_is_reported_at_one_five_and_ten_places(answers_of):
     p = answers_of([[0, 0], [0, 0]], [[9, 0], [1, 0]])
     p.ranked_xy[0, 4] = (2.0, 0.0)
     assert "50.0% at one place, 100.0% at five, 100.0% at ten" in recall_curves({"all": p})

@@ -50,7 +50,7 @@ def test_contents_lead_to_sections(document, page_of):
     assert {"figures", "errors", "search", "map", "lost", "streets", "worst"} <= ids
 
 
-def test_the_worst_queries_come_with_what_became_of_them(document, saved_run, page_of):
+def test_the_worst_queries_are_listed_with_their_outcome(document, saved_run, page_of):
     answers = SavedRun.open(saved_run).predictions["drive1_precise"]
     became, text = stages(answers), page_of(document).text
     order = [text.index(f"drive1_precise, query {row}") for row in worst(answers, 20)]

@@ -1,4 +1,4 @@
-"""A street of places that differ, as panoramas and as what a camera sees of them; made up, not simulated."""
+"""A synthetic street of distinct places, as panoramas and as camera views. It is not simulated."""
 
 import itertools
 from collections.abc import Callable
@@ -24,7 +24,7 @@ READING_S = 0.05
 
 @pytest.fixture(scope="module", autouse=True)
 def _counted_clock():
-    """Count readings of the processor's clock in place of time: a budget means the same number of steps everywhere."""
+    """Replace the processor clock by a counter, so a budget gives the same number of steps on every machine."""
     readings = itertools.count()
     clock = SimpleNamespace(process_time=lambda: READING_S * next(readings))
     with pytest.MonkeyPatch.context() as patch:
@@ -33,12 +33,12 @@ def _counted_clock():
 
 
 def walls_of(seed: int) -> np.ndarray:
-    """Distance of the walls round a place, by azimuth in 36 steps from -pi."""
+    """Return the distances of the walls around a place, by azimuth in 36 steps from -pi."""
     return np.random.default_rng([7, seed]).uniform(5, 35, 36)
 
 
 def ranges_along(walls: np.ndarray, azimuth: Any, elevation: Any, height_m: float) -> np.ndarray:
-    """Range, metres, to the ground or to a wall of 2.6 m, seen from a height; 0 above the walls."""
+    """Return the ranges, metres, to the ground or to a wall of 2.6 m, from a given height; 0 above the walls."""
     wall = walls[np.floor((azimuth + np.pi) % (2 * np.pi) / (2 * np.pi) * 36).astype(int).clip(0, 35)]
     z = height_m + wall * np.tan(elevation)
     ground = height_m / np.maximum(-np.sin(elevation), 1e-6)
@@ -55,10 +55,14 @@ def frames_of(count: int) -> Frames:
     )
     blank = np.zeros((count, 1, 1), np.uint8)
     return Frames(
-        aligned=blank, plain=blank, panoramas=np.where(panoramas > GRID.max_range_m, 0, panoramas).astype(np.float16),
-        intensities=np.full(panoramas.shape, 100, np.uint8), places=places,
-        T_map_lidar=np.tile(np.eye(4), (count, 1, 1)), street=np.arange(count, dtype=np.int64) // 5,
-    )  # fmt: skip
+        aligned=blank,
+        plain=blank,
+        panoramas=np.where(panoramas > GRID.max_range_m, 0, panoramas).astype(np.float16),
+        intensities=np.full(panoramas.shape, 100, np.uint8),
+        places=places,
+        T_map_lidar=np.tile(np.eye(4), (count, 1, 1)),
+        street=np.arange(count, dtype=np.int64) // 5,
+    )
 
 
 def pairs_of(places: list[int], headings_deg: list[float]) -> Pairs:
@@ -77,10 +81,15 @@ def pairs_of(places: list[int], headings_deg: list[float]) -> Pairs:
         rgb.append(np.random.default_rng(place).integers(0, 255, (SIDE, SIDE, 3)))
     count = len(places)
     return Pairs(
-        rgb=np.array(rgb, np.uint8), depth_mm=np.array(depth).clip(0, 65535).astype(np.uint16),
-        ranges=np.zeros((count, 1, 1), np.float16), colours=np.zeros((count, 1, 1, 3), np.uint8),
-        views=np.array(views), T_map_camera=np.array(poses), street=np.array(places, np.int64) // 5, camera=CAMERA,
-    )  # fmt: skip
+        rgb=np.array(rgb, np.uint8),
+        depth_mm=np.array(depth).clip(0, 65535).astype(np.uint16),
+        ranges=np.zeros((count, 1, 1), np.float16),
+        colours=np.zeros((count, 1, 1, 3), np.uint8),
+        views=np.array(views),
+        T_map_camera=np.array(poses),
+        street=np.array(places, np.int64) // 5,
+        camera=CAMERA,
+    )
 
 
 @pytest.fixture(scope="session")

@@ -7,9 +7,15 @@ from service.maps.streets import Streets
 def square(number: int, x: float) -> dict[str, object]:
     ring = [[x, 0.0], [x + 10, 0.0], [x + 10, 10.0], [x, 10.0], [x, 0.0]]
     return {
-        "properties": {"id": str(number), "street": str(number), "section": None, "name": f"Street {number}", "class_index": number},
+        "properties": {
+            "id": str(number),
+            "street": str(number),
+            "section": None,
+            "name": f"Street {number}",
+            "class_index": number,
+        },
         "geometry": {"type": "Polygon", "coordinates": [ring]},
-    }  # fmt: skip
+    }
 
 
 def test_a_point_off_every_street_is_of_the_nearest_and_none_is_of_none() -> None:

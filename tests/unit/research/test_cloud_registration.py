@@ -1,4 +1,4 @@
-"""A room whose walls tell every pose apart: a part of it, moved by a known pose, must be found again."""
+"""A room whose walls make every pose unique: a part of it, moved by a known pose, must be registered."""
 
 import sys
 
@@ -18,7 +18,7 @@ from service.geometry.rigid import inverse, rotation_z, transform_from, transfor
 
 
 def corner(seed=0):
-    """Ground, two walls that meet, and boxes beside them."""
+    """Return ground, two walls that intersect, and boxes beside them."""
     rng = np.random.default_rng(seed)
     u, v = rng.uniform(0, 20, (2, 6000))
     walls = [np.stack([u, v, 0 * u], 1), np.stack([u, 0 * u, v / 4], 1), np.stack([0 * u, u, v / 4], 1)]
@@ -34,7 +34,7 @@ def test_a_voxel_keeps_the_mean_of_its_points():
 
 
 def test_depth_is_back_projected_up_to_the_reach():
-    """The middle of three pixels looks straight ahead, the others a focal length to each side; the last is too far away."""
+    """The middle of three pixels looks straight ahead, the others one focal length to each side. The last is too far."""
     camera = PinholeCamera(3, 1, 1.0, 1.0, 1.0, 0.0)
     depth_m = np.array([[2.0, 3.0, REACH_M + 1]], np.float32)
     np.testing.assert_allclose(points_of_depth(depth_m, camera), [[-2.0, 0.0, 2.0], [0.0, 0.0, 3.0]])

@@ -31,7 +31,7 @@ TINY: dict[str, Any] = {"pairs": 4, "widths": (4, 4, 4), "descriptor": 8, "point
 
 @pytest.fixture(autouse=True)
 def one_thread():
-    """Nets as small as these only wait for each other's threads."""
+    """Small networks are slower on several threads."""
     before = torch.get_num_threads()
     torch.set_num_threads(1)
     yield
@@ -228,7 +228,7 @@ def test_a_stopped_training_goes_on_and_answers(kind, street_frames, street_pair
     assert len([json.loads(line) for line in more.curve.read_text().splitlines()]) >= 2
 
 
-def test_what_was_learnt_since_the_last_point_is_kept_at_the_end(lesson_of, tmp_path, monkeypatch):
+def test_progress_since_the_last_checkpoint_is_saved_at_the_end(lesson_of, tmp_path, monkeypatch):
     due = {0: 0.0}  # the first at once, no other before the end
     monkeypatch.setattr("research.baselines.dual.learn._next_point", lambda run, *_: due.get(len(run.curve), 2.0))
     settings = LearnSettings("dual", **TINY)

@@ -9,7 +9,7 @@ from service.errors import DatasetError
 
 
 def spend(training: Training, seconds: float) -> None:
-    """Read the tests' clock until the seconds have passed."""
+    """Read the fake clock until the seconds have passed."""
     until = training.processor_s + seconds
     while training.processor_s < until:
         pass
@@ -69,7 +69,7 @@ def test_a_run_ends_when_its_score_stops_gaining(tmp_path: Path, scores: tuple[f
     assert training.ended == ended
 
 
-def test_rests_are_counted_anew_after_each_and_a_new_best_ends_one() -> None:
+def test_the_count_of_rests_restarts_after_each_rest_and_each_new_best() -> None:
     assert rests([], 2) == 0
     assert rests([0.1, 0.1, 0.1], 2) == 1
     assert rests([0.1, 0.05, 0.2, 0.1], 2) == 0  # a new best in between

@@ -16,7 +16,7 @@ POINTS = np.array([[3.0, 4, 1.0], [4, 3, 2.0], [-20, -15, 5.0], [40, 1, 9.0], [3
 
 
 def slow_similarity(query, place):
-    """Sector by sector, shift by shift."""
+    """Compute sector by sector and shift by shift."""
     filled = [j for j in range(query.shape[1]) if query[:, j].any()]
     best = -np.inf
     for shift in range(query.shape[1]):

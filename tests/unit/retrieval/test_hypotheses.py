@@ -11,7 +11,7 @@ SETTINGS = ClusterSettings(views=10, radius_m=4.0, heading_rad=np.deg2rad(25), t
 
 
 def matches_of(*rows: tuple[float, float, float, float, int]) -> ViewMatches:
-    """Each row: similarity, x, y, heading in degrees, street; places are numbered in their order."""
+    """Return matches from rows: similarity, x, y, heading in degrees, street. Places have the number of their row."""
     similarity, x, y, heading, street = (np.array(column, np.float64) for column in zip(*rows, strict=True))
     positions = np.stack([x, y, np.full(len(rows), 2.0)], axis=1)
     return ViewMatches(

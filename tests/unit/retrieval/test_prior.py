@@ -14,7 +14,7 @@ def weight(prior, x=100.0, y=200.0, heading_deg=0.0):
 
 
 def fit_at(deviations):
-    """Logarithm of a Gaussian's share with a floor under it, 0 at best."""
+    """Return the logarithm of a Gaussian weight with a floor, at most 0."""
     return np.log((np.exp(-0.5 * deviations**2) + DOUBT) / (1 + DOUBT))
 
 
@@ -27,7 +27,7 @@ def test_a_pose_that_fits_in_every_way_weighs_nothing():
     ("x", "y", "deviations"), [(105, 200, 1), (95, 200, 1), (100, 210, 2), (103, 204, 1), (115, 200, 3)]
 )
 def test_a_position_counts_in_its_standard_deviations_whatever_the_heading(x, y, deviations):
-    """5 m each way; 3 and 4 m are 5 m."""
+    """5 m along each axis; 3 and 4 m are 5 m."""
     prior = Prior(position_m=HERE, position_std_m=5.0)
     for heading_deg in (0, 90, -170):
         assert weight(prior, x, y, heading_deg) == pytest.approx(fit_at(deviations))
@@ -44,12 +44,12 @@ def test_a_heading_counts_the_shorter_way_round_whatever_the_position(known_deg,
 
 
 def test_position_and_heading_count_together():
-    """Three deviations of one and four of the other are five."""
+    """Three standard deviations of one and four of the other are five."""
     prior = Prior(position_m=HERE, position_std_m=1.0, heading_rad=0.0, heading_std_rad=float(np.deg2rad(5)))
     assert weight(prior, 103, 200, 20) == pytest.approx(fit_at(5.0))
 
 
-def test_who_knows_nothing_prefers_nothing():
+def test_an_empty_prior_prefers_nothing():
     assert weight(Prior(), 1e6, -1e6, 123) == pytest.approx(0, abs=1e-12)
 
 
@@ -78,11 +78,11 @@ def test_many_poses_weigh_what_each_weighs_alone(poses):
     np.testing.assert_allclose(together, alone, atol=1e-9)
 
 
-def test_an_answer_at_the_prior_makes_a_stranger_as_rare_as_a_wrong_prior_and_one_far_from_it_changes_nothing():
+def test_an_answer_at_the_prior_makes_out_of_map_as_rare_as_a_wrong_prior_and_a_far_one_changes_nothing():
     prior = Prior(position_m=np.array([10.0, 20.0]), position_std_m=3.0)
     assert prior.known_nats(np.array([10.0, 20.0]), 1.0) == pytest.approx(-MOST_DOUBT)
     assert prior.known_nats(np.array([500.0, 20.0]), 1.0) == 0.0
 
 
-def test_a_heading_alone_says_nothing_of_whether_the_place_is_in_the_map():
+def test_a_heading_prior_does_not_change_the_probability_that_the_place_is_in_the_map():
     assert Prior(heading_rad=0.3).known_nats(np.array([1.0, 2.0]), 0.3) == 0.0

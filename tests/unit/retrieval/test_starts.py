@@ -19,7 +19,7 @@ ANY_SIMILARITY = 3.0  # no two cosines are so far apart
 
 @pytest.fixture(scope="module")
 def starts(frame_with):
-    """From one frame whose camera stands 1.4 m high, on a map whose LiDAR stood 1.8 m high."""
+    """Return starts from one frame with a camera height of 1.4 m, on a map with a LiDAR height of 1.8 m."""
 
     def made(matches, *, prior=None, less_similar=ANY_SIMILARITY, **options):
         chosen = StartSettings(less_similar=less_similar, temperature=0.02, **options)
@@ -29,13 +29,13 @@ def starts(frame_with):
 
 
 def rows_of(found, matches):
-    """Which matches the starts were made of: no two places are the same."""
+    """Return the matches of the starts. All places differ."""
     xy = matches.T_map_place[:, :2, 3]
     return [int(np.argmin(np.linalg.norm(xy - start.camera_m[:2], axis=1))) for start in found]
 
 
 def test_a_start_stands_at_the_cameras_height_and_looks_along_the_view(matches_at, starts):
-    """1.4 - 1.8 m above a LiDAR that is at 12 m: 11.6 m."""
+    """1.4 - 1.8 m above a LiDAR at 12 m is 11.6 m."""
     (found,) = starts(matches_at([(5, 6, 12)], [90], [0.8]))
     np.testing.assert_allclose(found.camera_m, [5, 6, 11.6], atol=1e-12)
     np.testing.assert_allclose(found.R_map_level, rotation_z(np.pi / 2), atol=1e-12)
@@ -43,7 +43,7 @@ def test_a_start_stands_at_the_cameras_height_and_looks_along_the_view(matches_a
 
 
 def test_on_a_slope_the_start_stands_along_the_grounds_normal(matches_at, starts):
-    """A slope of 3 in 4 up along x has the normal (-0.6, 0, 0.8)."""
+    """A slope of 3 in 4 along x has the normal (-0.6, 0, 0.8)."""
     normal = np.array([-0.6, 0, 0.8])
     slope = rotation_taking(np.array([0, 0, 1.0]), normal)
     (found,) = starts(matches_at([(5, 6, 12)], [0], [0.8], R_map_place=slope))
@@ -86,7 +86,7 @@ def test_the_best_of_like_views_stands_for_them(matches_at, starts):
 
 @pytest.mark.parametrize(("similarity", "starts_one"), [(0.79, True), (0.77, False)])
 def test_a_view_that_is_much_less_similar_than_the_best_starts_nothing(matches_at, starts, similarity, starts_one):
-    """The best is at 0.9, and 0.12 less is still a start."""
+    """The best has 0.9. A view with 0.12 less is still a start."""
     found = starts(matches_at([(0, 0, 2), (10, 0, 2)], [0, 0], [0.9, similarity]), less_similar=0.12)
     assert [round(each.camera_m[0]) for each in found] == ([0, 10] if starts_one else [0])
 
@@ -119,7 +119,7 @@ def test_starts_are_distinct_the_best_first_and_at_most_so_many(matches_at, star
 
 @pytest.fixture
 def row_of_places(matches_at):
-    """Ten places 10 m apart along x, each 0.001 less similar than the one before."""
+    """Return ten places 10 m apart along x, each 0.001 less similar than the one before."""
     return matches_at([(10 * k, 0, 2) for k in range(10)], [0] * 10, [0.9 - 0.001 * k for k in range(10)])
 
 
@@ -128,7 +128,7 @@ def x_of(found):
 
 
 def test_half_of_the_starts_are_taken_with_a_prior_and_the_rest_without_it(row_of_places, starts):
-    """20 m around x = 90, 0.02 of similarity a nat: half a deviation off costs 0.0025, one 0.01, and x = 0 all of 0.1."""
+    """Prior 20 m around x = 90, 0.02 of similarity per nat: 0.5 sigma costs 0.0025, 1 sigma 0.01, and x = 0 the limit 0.1."""
     prior = Prior(position_m=np.array([90.0, 0.0]), position_std_m=20.0)
     assert x_of(starts(row_of_places, prior=prior, most=5)) == [90, 80, 70, 0, 10]
     assert x_of(starts(row_of_places, prior=prior, most=4)) == [90, 80, 0, 10]
@@ -143,7 +143,7 @@ def test_with_a_prior_too_every_start_is_numbered_and_taken_once(row_of_places, 
 
 @pytest.mark.parametrize(("prior_x_m", "expected"), [(10.0, [10, 0]), (0.0, [0])])
 def test_a_prior_lets_a_less_similar_view_start_where_it_fits(matches_at, starts, prior_x_m, expected):
-    """0.15 less similar, but the better one loses 0.1 by standing far from the prior."""
+    """It has 0.15 less similarity, but the better one loses 0.1 by its distance from the prior."""
     matches = matches_at([(0, 0, 2), (10, 0, 2)], [0, 0], [0.9, 0.75])
     prior = Prior(position_m=np.array([prior_x_m, 0.0]), position_std_m=1.0)
     assert sorted(x_of(starts(matches, prior=prior, less_similar=0.12))) == sorted(expected)
@@ -159,8 +159,8 @@ def test_a_prior_of_the_heading_alone_moves_views_of_that_heading_forward(matche
 AHEAD_3_M = transform_from(np.eye(3), np.array([0.0, 0.0, 3.0]))  # optical: z is forward
 
 
-def test_what_another_frame_resembles_is_carried_to_where_the_reference_then_stood(matches_at, frame_with):
-    """A frame taken 3 m ahead that resembles x = 10, looking along y, puts the reference 3 m behind: (10, -3)."""
+def test_a_match_of_another_frame_is_transformed_to_the_reference(matches_at, frame_with):
+    """A frame 3 m ahead matches x = 10 with a view along y. So the reference is 3 m behind: (10, -3)."""
     reference = frame_with(matches_at([(50, 50, 12)], [0], [0.9]))
     ahead = frame_with(matches_at([(10, 0, 12)], [90], [0.8]), T_reference_camera=AHEAD_3_M)
     found = starts_from(
@@ -171,7 +171,7 @@ def test_what_another_frame_resembles_is_carried_to_where_the_reference_then_sto
 
 
 def test_a_camera_that_looks_left_puts_the_reference_to_the_right_of_its_heading(matches_at, frame_with):
-    """On a rig, 1 m to the left and looking left: what it sees along y (90 degrees), the reference sees along x."""
+    """The camera is 1 m to the left of the reference and looks left. It matches a view along y, so the reference looks along x."""
     left = transform_from(R_BODY_OPTICAL.T @ rotation_z(np.pi / 2) @ R_BODY_OPTICAL, np.array([-1.0, 0.0, 0.0]))
     reference = frame_with(matches_at([(50, 50, 12)], [0], [0.9]))
     beside = frame_with(matches_at([(10, 0, 12)], [90], [0.8]), T_reference_camera=left)
@@ -183,7 +183,7 @@ def test_a_camera_that_looks_left_puts_the_reference_to_the_right_of_its_heading
 
 
 def test_frames_of_one_drive_agree_on_one_start(matches_at, frame_with):
-    """The one 3 m ahead resembles the place 3 m ahead: both say the same of the reference."""
+    """The frame 3 m ahead matches the place 3 m ahead. So both give the same reference pose."""
     reference = frame_with(matches_at([(10, 0, 2)], [0], [0.8]))
     ahead = frame_with(matches_at([(13, 0, 2)], [0], [0.9]), T_reference_camera=AHEAD_3_M)
     assert x_of(
@@ -199,8 +199,8 @@ def test_the_most_similar_match_comes_first_whichever_frame_found_it(matches_at,
     ) == [10, 50]
 
 
-def test_starts_of_several_frames_are_ranked_by_what_all_of_them_say(matches_at, frame_with):
-    """Look-alikes of single frames at 50 and 80 crowd out 10, which all frames resemble, but none of them most."""
+def test_starts_of_several_frames_are_ranked_by_all_frames(matches_at, frame_with):
+    """Aliases of single frames at 50 and 80 displace 10, which is second best for all frames."""
     asked = []
 
     def likeness(T_map_level):
@@ -223,9 +223,12 @@ def test_starts_of_several_frames_are_ranked_by_what_all_of_them_say(matches_at,
 def test_starts_that_all_frames_find_less_like_the_map_than_the_best_start_nothing(matches_at, frame_with):
     reference = frame_with(matches_at([(50, 0, 2), (10, 0, 2)], [0, 0], [0.9, 0.85]))
     found = starts_from(
-        (reference, reference), None, lidar_height_m=1.8, settings=StartSettings(less_similar=0.1),
+        (reference, reference),
+        None,
+        lidar_height_m=1.8,
+        settings=StartSettings(less_similar=0.1),
         likeness=lambda T: np.where(T[:, 0, 3] < 30, 0.8, 0.69),
-    )  # fmt: skip
+    )
     assert x_of(found) == [10]
 
 
@@ -233,9 +236,12 @@ def test_a_prior_moves_starts_of_several_frames_forward_too(matches_at, frame_wi
     reference = frame_with(matches_at([(0, 0, 2), (50, 0, 2), (100, 0, 2)], [0, 0, 0], [0.9, 0.9, 0.9]))
     prior = Prior(position_m=np.array([100.0, 0.0]), position_std_m=5.0)
     found = starts_from(
-        (reference, reference), prior, lidar_height_m=1.8, settings=StartSettings(most=2, less_similar=ANY_SIMILARITY),
+        (reference, reference),
+        prior,
+        lidar_height_m=1.8,
+        settings=StartSettings(most=2, less_similar=ANY_SIMILARITY),
         likeness=lambda T: np.where(T[:, 0, 3] == 50, 0.9, 0.8),
-    )  # fmt: skip
+    )
     assert x_of(found) == [100, 50]
 
 
@@ -246,7 +252,7 @@ angle = st.floats(-0.3, 0.3)
 def test_a_point_is_the_same_point_in_the_level_frames_of_both_cameras(
     matches_at, frame_with, pitch, other_pitch, turn, position
 ):
-    """Whether it goes through the cameras or from level frame to level frame."""
+    """Via the cameras, or from level frame to level frame, the result is equal."""
     R_level_camera, R_level_reference = (rotation_y(each) @ R_BODY_OPTICAL for each in (pitch, other_pitch))
     T_reference_camera = transform_from(rotation_y(turn), np.array(position))
     in_camera = np.array([[1.0, 2.0, 3.0], [-4.0, 0.5, 9.0]])

@@ -1,7 +1,7 @@
-"""A service without a network: real supervisor, registry, watcher and table, and bundles that are empty folders. A program of its own.
+"""A service without a network: real supervisor, registry, watcher and table, with empty folders as bundles. It is a program.
 
-Its workers note which version of the only map serves, and when they looked, as fast as they can. Meanwhile versions arrive, are
-chosen and are removed, and workers are killed at random. It prints how many answers there were, and those that disagree.
+Workers record continuously which version serves, and when they looked. Meanwhile versions arrive, are chosen and are
+removed, and workers are killed at random. The program prints the number of answers, and those that disagree.
 """
 
 import os
@@ -59,7 +59,7 @@ def told(path: Path, text: str) -> None:
 
 
 class Service:
-    """The folders, and what is done to them."""
+    """The folders of a service, and the changes to them."""
 
     def __init__(self, folder: Path) -> None:
         self.maps, self.log = folder / "maps", folder / "log"
@@ -111,7 +111,7 @@ class Service:
 
 
 class Driver:
-    """Does to a service what an operator, and chance, may do to it, one thing after another."""
+    """Makes the changes of an operator, and random faults, one after another."""
 
     def __init__(self, service: Service, supervisor: int, seed: int) -> None:
         self.supervisor = supervisor
@@ -146,16 +146,16 @@ class Driver:
         return self.table.read().maps["m"].serving
 
     def arrive(self) -> None:
-        """A newer version takes over, whatever was chosen."""
+        """Add a newer version; it serves after any choice."""
         begun = time.monotonic()
         self._until_served(self.service.put(), begun)
 
     def damaged(self) -> None:
-        """A damaged bundle changes nothing; nor do its number and its folder."""
+        """Add a damaged bundle; it changes nothing, neither by its number nor by its folder."""
         self.service.put(damaged=True)
 
     def choose(self) -> None:
-        """A version whose folder may be gone."""
+        """Choose a version whose folder may be gone."""
         begun, wanted = time.monotonic(), self.chance.choice(self.versions)
         try:
             self.table.choose("m", wanted)
@@ -164,15 +164,15 @@ class Driver:
         self._until_served(wanted, begun)
 
     def remove(self) -> None:
-        """A folder goes; without SIGHUP that changes nothing."""
+        """Remove a folder; without SIGHUP that changes nothing."""
         name = self.chance.choice(self.versions)
         if len([each for each in self.versions if (self.service.maps / each).exists()]) > 1:
             shutil.rmtree(self.service.maps / name, ignore_errors=True)
 
     def hang_up(self) -> None:
-        """What lies in no folder is taken out; of what is left the newest serves if the one that served went.
+        """Send SIGHUP: versions without a folder are unmounted. If the serving one is gone, the newest serves.
 
-        It is over when every worker has looked, so no worker may be killed before it has.
+        It ends when every worker has looked, so no worker may be killed before.
         """
         with self._killing:
             self.until(lambda: all(map(self.service.memory.lives, range(WORKERS))))
@@ -202,12 +202,12 @@ class Driver:
             time.sleep(0.001)
 
     def _answers(self, number: int) -> bool:
-        """Whether a worker lives and has joined, and not only the one before it that had its number."""
+        """Return whether a worker runs and has joined, and not its predecessor with the same number."""
         pid, joined = ((folder / str(number)).read_text() for folder in (self.service.pids, self.service.answering))
         return pid == joined and self.service.memory.lives(number)
 
     def _kill_now_and_then(self) -> None:
-        """At least one worker goes on, so that a version whose folder is gone stays open somewhere."""
+        """Kill workers at random. At least one survives, so a version without a folder stays open."""
         while not self._stop.wait(self.chance.uniform(0, 0.15)):
             with self._killing:
                 answering = [number for number in range(WORKERS) if self._answers(number)]

@@ -7,7 +7,7 @@ from service.runtime.serving_table import SharedMemory
 
 
 class Memory(SharedMemory):
-    """Shared by objects of one process instead of processes, so it is told who lives."""
+    """A serving table shared by objects of one process. The test declares which workers are alive."""
 
     def __init__(self) -> None:
         super().__init__()

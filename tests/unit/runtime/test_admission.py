@@ -14,7 +14,7 @@ from service.runtime.admission import Admission, MemoryBudget
 
 @pytest.fixture
 def blocked() -> Iterator[tuple[Admission, threading.Event]]:
-    """One worker at work until the event is set, one place in the queue."""
+    """Block the only worker until the event is set, with one slot in the queue."""
     admission, release, running = Admission(threads=1, queue=1), threading.Event(), threading.Event()
 
     def hold() -> None:
@@ -74,8 +74,8 @@ def test_all_places_are_free_again_when_all_is_done() -> None:
     admission.close()
 
 
-def test_what_was_cancelled_while_it_waited_is_not_kept(blocked: tuple[Admission, threading.Event]) -> None:
-    """Its place is free at once, and so is its memory, although the pool's queue still has it."""
+def test_a_request_cancelled_in_the_queue_is_freed(blocked: tuple[Admission, threading.Event]) -> None:
+    """Its slot and its memory are free at once, although the queue of the pool still holds it."""
     admission, _ = blocked
 
     class Pictures:
@@ -102,7 +102,7 @@ def test_a_closed_pool_refuses() -> None:
         admission.submit(lambda: None)
 
 
-def test_what_does_not_fit_beside_others_is_busy_and_what_never_fits_is_too_large() -> None:
+def test_a_request_that_does_not_fit_now_is_busy_and_one_that_never_fits_is_too_large() -> None:
     budget = MemoryBudget(10)
     with budget.hold() as one, budget.hold() as other:
         one.grow(6)
@@ -130,7 +130,7 @@ def test_work_that_goes_on_after_its_caller_keeps_its_memory() -> None:
     assert budget.held == 0
 
 
-def test_what_is_left_to_a_picture_goes_with_it() -> None:
+def test_the_memory_left_to_an_image_is_freed_with_it() -> None:
     budget, picture = MemoryBudget(10), np.zeros(3)
     with budget.hold() as hold:
         hold.grow(6)
@@ -143,7 +143,7 @@ def test_what_is_left_to_a_picture_goes_with_it() -> None:
     assert budget.held == 0
 
 
-def test_watchers_are_told_of_every_change() -> None:
+def test_watchers_receive_every_change() -> None:
     budget, told = MemoryBudget(10), list[float]()
     budget.watch(told.append)
     with budget.hold() as hold:

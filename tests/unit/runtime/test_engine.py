@@ -92,20 +92,22 @@ def twins(twin_map: Path) -> Iterator[Engine]:
 
 
 @pytest.mark.parametrize("y", [0.0, 90.0])
-def test_a_prior_in_degrees_tells_two_streets_apart_like_one_in_metres(
+def test_a_prior_in_degrees_decides_between_two_streets_like_one_in_metres(
     twins: Engine, encoded: EncodedQuery, y: float
 ) -> None:
     earth = MapBundle.open(twins.registry.get(None).bundle.path).earth
     assert earth is not None
-    known = (replace(encoded, prior=Prior(position_m=np.array([20.0, y]), position_std_m=10.0)),
-             replace(encoded, prior=Prior(position_std_m=10.0), prior_wgs84=earth.to_earth(np.array([20.0, y, 0.0]))[:2]))  # fmt: skip
+    known = (
+        replace(encoded, prior=Prior(position_m=np.array([20.0, y]), position_std_m=10.0)),
+        replace(encoded, prior=Prior(position_std_m=10.0), prior_wgs84=earth.to_earth(np.array([20.0, y, 0.0]))[:2]),
+    )
     in_metres, in_degrees = (twins.localize(each).answer for each in known)
     np.testing.assert_allclose(in_metres.T_map_camera_guess[:2, 3], [20, y], atol=0.3)
     np.testing.assert_allclose(in_degrees.T_map_camera_guess, in_metres.T_map_camera_guess, atol=1e-6)
 
 
 def test_a_prior_in_degrees_keeps_what_else_is_known(twins: Engine, encoded: EncodedQuery) -> None:
-    """A hundredth of a degree north and east of Berlin's middle: 1112.7 m and 678.6 m."""
+    """0.01 degrees north and east of the centre of Berlin: 1112.7 m and 678.6 m."""
     prior = Prior(position_std_m=7.0, heading_rad=1.25, heading_std_rad=0.5)
     bundle = twins.registry.get(None).bundle
     found = prior_in(replace(encoded, prior=prior, prior_wgs84=(52.53, 13.415)), bundle)
@@ -138,7 +140,7 @@ def test_the_services_rate_of_false_accepts_holds_where_a_query_names_none(
     of_query: float | None,
     status: str,
 ) -> None:
-    """Even odds whatever the evidence: enough for one in a hundred, not for one in a thousand."""
+    """Confidence 0.5 is enough for a rate of 1 %, and not for 0.1 %."""
     write_bundle(tmp_path / "m", content_of(calibration=calibration_json()))
     engine = Engine.open(Settings(maps=(tmp_path / "m",), threads=1, false_accept_rate=of_service))
     assert engine.localize(replace(encoded, false_accept_rate=of_query)).answer.status == status
@@ -164,7 +166,7 @@ def test_an_empty_maps_folder_is_a_service_that_is_not_ready(
 def test_a_map_that_would_refuse_every_request_is_not_mounted(
     content_of: Callable[..., Any], calibration_json: Callable[..., Any], tmp_path: Path
 ) -> None:
-    """Its calibration promises one false accept in a thousand, and the service's setting wants fewer."""
+    """Its calibration allows 0.1 % of false accepts, and the service requires less."""
     write_bundle(tmp_path / "calibrated", content_of(name="calibrated", calibration=calibration_json()))
     asked = (
         "false_accept_rate is 0.0005, but .* supports 0.001 or more.* set STREETFIX_FALSE_ACCEPT_RATE to 0.001 or more"

@@ -1,4 +1,4 @@
-"""Freed memory goes back to the system, in a process of its own since the C library's settings are the process'."""
+"""Freed memory goes back to the system. The test uses its own process, because the settings of malloc are per process."""
 
 import platform
 import subprocess

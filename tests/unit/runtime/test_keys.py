@@ -21,7 +21,7 @@ def test_a_key_leads_to_its_name(tmp_path):
     assert (ring.require("a"), ring.require("b")) == (Caller("robot-7"), Caller("lab"))
 
 
-def test_an_operators_key_says_so(tmp_path):
+def test_an_operator_key_is_marked(tmp_path):
     ring = ring_of(tmp_path, f"robot {A}\nme {B} operator")
     assert (ring.require("a").operator, ring.require("b").operator) == (False, True)
 

@@ -1,4 +1,4 @@
-"""The ring of last answers."""
+"""The buffer of the last answers."""
 
 from collections.abc import Callable, Iterator
 from pathlib import Path

@@ -11,13 +11,19 @@ TRACE = "4bf92f3577b34da6a3ce929d0e0e4736"
 @pytest.mark.parametrize(
     ("header", "expected"),
     [
-        (f"00-{TRACE}-00f067aa0ba902b7-01", TRACE), (f" 00-{TRACE}-00f067aa0ba902b7-01 ", TRACE), (None, None), ("", None),
-        (f"00-{TRACE}-00f067aa0ba902b7", None), (f"00-{TRACE.upper()}-00f067aa0ba902b7-01", None),
-        (f"00-{'0' * 32}-00f067aa0ba902b7-01", None), (f"00-{TRACE}-{'0' * 16}-01", None), (f"00-{TRACE[:-1]}-00f067aa0ba902b7-01", None),
+        (f"00-{TRACE}-00f067aa0ba902b7-01", TRACE),
+        (f" 00-{TRACE}-00f067aa0ba902b7-01 ", TRACE),
+        (None, None),
+        ("", None),
+        (f"00-{TRACE}-00f067aa0ba902b7", None),
+        (f"00-{TRACE.upper()}-00f067aa0ba902b7-01", None),
+        (f"00-{'0' * 32}-00f067aa0ba902b7-01", None),
+        (f"00-{TRACE}-{'0' * 16}-01", None),
+        (f"00-{TRACE[:-1]}-00f067aa0ba902b7-01", None),
     ],
-)  # fmt: skip
+)
 def test_a_trace_is_known_by_a_well_formed_header_alone(header, expected):
-    """The example of the W3C's recommendation, and ways to break it."""
+    """The example of the W3C recommendation, and damaged forms of it."""
     assert trace_id_of(header) == expected
 
 
@@ -42,9 +48,16 @@ def test_a_request_is_one_json_object_a_line(request_record):
     told = json.loads(line)
     assert told.pop("time").endswith("+00:00")
     assert told == {
-        "level": "info", "logger": "streetfix.requests", "event": "request", "face": "rest", "method": "localize", "code": "200",
-        "ms": 12.3, "request_id": "r1", "trace_id": TRACE,
-    }  # fmt: skip
+        "level": "info",
+        "logger": "streetfix.requests",
+        "event": "request",
+        "face": "rest",
+        "method": "localize",
+        "code": "200",
+        "ms": 12.3,
+        "request_id": "r1",
+        "trace_id": TRACE,
+    }
 
 
 def test_or_one_line_of_text(request_record):

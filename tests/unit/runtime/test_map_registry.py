@@ -48,7 +48,7 @@ def test_the_same_version_twice_is_refused(bundle_path: Path, bundle_copy: Path)
 
 @pytest.fixture
 def versions(content_of: Callable[..., BundleContent], tmp_path: Path) -> list[Localizer]:
-    """Four versions of one map, the oldest first."""
+    """Return four versions of one map, the oldest first."""
     found = []
     for seed in range(4):
         path = tmp_path / f"v{seed}"
@@ -114,7 +114,7 @@ def test_the_same_version_from_another_folder_takes_its_place(versions: list[Loc
 @pytest.mark.parametrize(
     ("name", "version", "told"), [("west", "x", "mounted maps: tiny"), ("tiny", "x", "version 'x' of 'tiny' not found")]
 )
-def test_what_is_not_open_cannot_serve(versions: list[Localizer], name: str, version: str, told: str) -> None:
+def test_a_version_that_is_not_open_cannot_serve(versions: list[Localizer], name: str, version: str, told: str) -> None:
     registry = MapRegistry(versions[:1])
     with pytest.raises(UnknownMapError, match=told):
         registry.serve(name, version)

@@ -18,7 +18,7 @@ Content = Callable[..., BundleContent]
 
 
 class Watched:
-    """A folder of maps, its registry and watcher, and what was warmed."""
+    """A folder of maps, its registry and watcher, and the warmed maps."""
 
     def __init__(self, folder: Path, content_of: Content) -> None:
         self.folder, self._content_of = folder, content_of
@@ -79,7 +79,7 @@ def test_a_bundle_that_was_replaced_in_its_place_serves_and_the_old_one_can_be_r
     assert old in watched.registry.versions("tiny")
 
 
-def test_a_damaged_bundle_is_told_once_and_the_old_one_serves_on(watched: Watched) -> None:
+def test_a_damaged_bundle_is_reported_once_and_the_old_one_keeps_serving(watched: Watched) -> None:
     watched.write("second", seed=1)
     places = watched.folder / "second" / "places.npy"
     content = bytearray(places.read_bytes())
@@ -114,7 +114,7 @@ def test_a_map_that_cannot_answer_does_not_serve(watched: Watched) -> None:
     assert watched.serving() == "first"
 
 
-def test_what_is_gone_stays_until_the_operator_says_so(watched: Watched) -> None:
+def test_a_removed_version_stays_until_the_operator_signals(watched: Watched) -> None:
     watched.write("second", seed=1)
     watched.watcher.scan()
     shutil.rmtree(watched.folder / "second")
@@ -153,7 +153,7 @@ def test_a_folder_that_is_empty_for_the_moment_changes_nothing(watched: Watched)
     assert watched.registry.get("tiny") is not None
 
 
-def test_it_looks_by_itself_and_at_once_when_told(watched: Watched) -> None:
+def test_it_looks_periodically_and_at_once_on_a_signal(watched: Watched) -> None:
     watched.watcher.start(0.05)
     watched.write("second", seed=1)
     _until(lambda: watched.serving() == "second")
@@ -176,7 +176,7 @@ def _until(true: Callable[[], bool]) -> None:
 def test_a_folder_that_vanishes_while_it_is_looked_at_does_no_harm(
     bundle_copy: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Found by fifty swaps under load: a bundle was being removed."""
+    """Found by fifty swaps under load, while a bundle was removed."""
     whole = stamp_of(bundle_copy)
     real, gone = os.scandir, bundle_copy / "cloud"
 
@@ -190,7 +190,7 @@ def test_a_folder_that_vanishes_while_it_is_looked_at_does_no_harm(
 
 
 def started(*paths: Path, strict: bool = False, warm: Callable[[Localizer], None] = lambda _: None) -> MapRegistry:
-    """What a service that was started on these folders has mounted."""
+    """Return what a service mounts when it starts on these folders."""
     registry = MapRegistry()
     MapWatcher(registry, paths, warm=warm).open_first(strict=strict)
     return registry
@@ -236,7 +236,7 @@ def test_a_start_fails_if_there_are_bundles_and_none_can_be_mounted(watched: Wat
 
 
 def test_a_start_without_any_bundle_waits_for_one(tmp_path: Path, content_of: Content) -> None:
-    """A fresh volume, as a container gets it: empty but for a folder that only root may look into."""
+    """A fresh volume of a container is empty except for a folder that only root can read."""
     folder = tmp_path / "volume"
     (folder / "lost+found").mkdir(parents=True, mode=0)
     (folder / ".hidden").mkdir()
@@ -250,7 +250,7 @@ def test_a_start_without_any_bundle_waits_for_one(tmp_path: Path, content_of: Co
 
 
 def test_a_folder_that_may_not_be_read_is_passed_over(watched: Watched, monkeypatch: pytest.MonkeyPatch) -> None:
-    """As lost+found is for everybody but root, who runs these tests at times."""
+    """lost+found is like this for other users than root. These tests may run as root."""
     real = Path.exists
 
     def exists(path: Path, **options: bool) -> bool:
@@ -309,7 +309,7 @@ def test_an_older_one_is_opened_in_place_of_a_newer_one_that_is_damaged(watched:
     assert [each.bundle for each in registry.refused] == ["v3"]
 
 
-def test_what_was_refused_is_reported_until_it_is_whole_or_gone(watched: Watched) -> None:
+def test_a_refused_bundle_is_reported_until_it_is_repaired_or_removed(watched: Watched) -> None:
     for name in ("mended", "removed"):
         watched.write(name, seed=1, name=name)
         damage(watched.folder / name)
@@ -322,7 +322,7 @@ def test_what_was_refused_is_reported_until_it_is_whole_or_gone(watched: Watched
     assert watched.registry.refused == ()
 
 
-def test_an_explicit_look_tries_again_what_was_refused_though_its_files_are_the_same(watched: Watched) -> None:
+def test_an_explicit_look_retries_refused_bundles_with_unchanged_files(watched: Watched) -> None:
     failing = [True]
 
     def warm(_: Localizer) -> None:
@@ -337,7 +337,7 @@ def test_an_explicit_look_tries_again_what_was_refused_though_its_files_are_the_
     assert watcher.scan(drop_missing=True)[0].startswith("mounted")
 
 
-def test_a_version_whose_folder_went_can_be_rolled_back_to_and_still_tells_its_streets(watched: Watched) -> None:
+def test_a_rollback_to_a_version_without_a_folder_works_and_its_streets_are_listed(watched: Watched) -> None:
     old = watched.registry.get("tiny")
     watched.write("second", seed=1)
     watched.watcher.scan()
@@ -349,8 +349,8 @@ def test_a_version_whose_folder_went_can_be_rolled_back_to_and_still_tells_its_s
     assert b"FeatureCollection" in old.bundle.streets_geojson()
 
 
-def test_several_that_are_gone_go_at_once(watched: Watched, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Else the second would serve for a moment."""
+def test_several_missing_versions_are_unmounted_at_once(watched: Watched, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Otherwise the second would serve for a moment."""
     for seed in (1, 2):
         watched.write(f"v{seed}", seed=seed)
     watched.watcher.scan()
@@ -381,10 +381,10 @@ def test_a_folder_that_cannot_be_read_for_the_moment_loses_nothing(
 
 
 def test_a_hangup_that_comes_just_after_a_look_is_not_lost(watched: Watched, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The event is set between the end of a wait and whatever follows."""
+    """The event is set between the end of a wait and the next step."""
     watcher = watched.watcher
     looks: list[bool] = []
-    real = watcher._told.wait
+    real = watcher._wakeup.wait
 
     def wait(timeout: float | None = None) -> bool:
         told = real(0.0)
@@ -392,7 +392,7 @@ def test_a_hangup_that_comes_just_after_a_look_is_not_lost(watched: Watched, mon
             watcher.look_now()
         return told
 
-    monkeypatch.setattr(watcher._told, "wait", wait)
+    monkeypatch.setattr(watcher._wakeup, "wait", wait)
     monkeypatch.setattr(watcher, "scan", lambda *, drop_missing=False: looks.append(drop_missing) or [])
     watcher.start(0.0)
     _until(lambda: True in looks)

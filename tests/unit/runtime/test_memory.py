@@ -1,4 +1,4 @@
-"""How large the budget of memory is."""
+"""The size of the memory budget."""
 
 from pathlib import Path
 from typing import Any
@@ -34,13 +34,17 @@ def groups(tmp_path: Path, own: str, files: dict[str, str]) -> tuple[Path, Path]
         ("0::/a/b\n", {"a/b/memory.max": "1048576\n", "a/memory.max": "3145728\n"}, MIB),
         ("0::/../../pod\n", {"memory.max": "2097152\n"}, 2 * MIB),
         ("4:memory:/docker/x\n0::/\n", {"memory/memory.limit_in_bytes": "2097152\n"}, 2 * MIB),
-        ("4:cpu,memory:/x\n", {"memory/x/memory.limit_in_bytes": "1048576\n", "memory/memory.limit_in_bytes": UNLIMITED}, MIB),
+        (
+            "4:cpu,memory:/x\n",
+            {"memory/x/memory.limit_in_bytes": "1048576\n", "memory/memory.limit_in_bytes": UNLIMITED},
+            MIB,
+        ),
         ("4:memory:/x\n", {"memory/memory.limit_in_bytes": UNLIMITED}, None),
         ("0::/x\n", {"unified/x/memory.max": "1048576\n"}, MIB),
         ("nonsense", {"memory.max": "nonsense"}, None),
         ("", {}, None),
     ],
-)  # fmt: skip
+)
 def test_the_least_limit_of_all_control_groups_counts(
     tmp_path: Path, own: str, files: dict[str, str], expected: int | None
 ) -> None:
@@ -59,7 +63,7 @@ def limited(monkeypatch: pytest.MonkeyPatch) -> Any:
     return to
 
 
-def test_what_the_process_and_its_maps_need_is_taken_off(limited: Any) -> None:
+def test_the_memory_of_process_and_maps_is_subtracted(limited: Any) -> None:
     limited(2 * GIB)
     settings = Settings()
     plain = budget_of(settings, threads=2).limit
@@ -89,7 +93,7 @@ def test_messages_that_grpc_reads_are_taken_off(limited: Any) -> None:
 
 
 @pytest.mark.parametrize("settings", [{}, {"request_memory_mib": 100}, {"workers": 8, "request_memory_mib": 800}])
-def test_too_little_is_told_with_the_remedy(limited: Any, settings: dict[str, Any]) -> None:
+def test_too_little_memory_is_reported_with_the_remedy(limited: Any, settings: dict[str, Any]) -> None:
     limited(300 * MIB)
     with pytest.raises(RequestError, match=r"request_memory_mib|memory limit") as refused:
         budget_of(Settings(**settings), threads=2)

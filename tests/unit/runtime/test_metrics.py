@@ -1,4 +1,4 @@
-"""Prometheus' own parser reads what the service tells."""
+"""Prometheus' own parser reads the metrics of the service."""
 
 import threading
 from collections.abc import Callable, Iterator
@@ -25,7 +25,7 @@ def engine(bundle_path: Path) -> Iterator[Engine]:
 
 
 def values(engine: Engine) -> dict[tuple[str, tuple[tuple[str, str], ...]], float]:
-    """Every sample by its name and labels."""
+    """Return every sample by its name and labels."""
     families = text_string_to_metric_families(engine.metrics.text().decode())
     return {
         (each.name, tuple(sorted(each.labels.items()))): each.value for family in families for each in family.samples
@@ -67,7 +67,7 @@ def test_an_error_is_no_answer(engine: Engine, parts_of: Parts) -> None:
     assert not any(name == "streetfix_answers_total" for name, _ in values(engine))
 
 
-def test_requests_are_counted_by_what_became_of_them(engine: Engine) -> None:
+def test_requests_are_counted_by_outcome(engine: Engine) -> None:
     for seconds, code in ((0.003, "200"), (0.05, "200"), (0.001, "503")):
         engine.metrics.requested("rest", "localize", code, seconds)
     found = values(engine)

@@ -1,4 +1,4 @@
-"""Frames of one stream or sequence with options of every kind: each answer is finite and agrees with itself."""
+"""Frames of one stream or sequence with mixed options. Each answer is finite and consistent."""
 
 import json
 import math
@@ -21,7 +21,6 @@ from service.grpc.messages import answer_message
 from service.localization import localizer as localizer_module
 from service.localization.answer import Answer, require_finite
 from service.localization.localizer import Localizer
-from service.maps.calibration import terms
 from service.maps.reader import MapBundle
 from service.maps.writer import write_bundle
 from service.retrieval.prior import Prior
@@ -36,10 +35,14 @@ EXAMPLES = 20
 
 @pytest.fixture(scope="module")
 def engine(content_of: Any, calibration_json: Any, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Engine]:
-    """A calibrated map whose confidence depends on every figure of the evidence."""
+    """Return an engine with a calibrated map whose confidence depends on every feature."""
     document = calibration_json()
+    weights = np.random.default_rng(1).normal(0, 0.05, len(FEATURES))
     for name in ("right", "known"):
-        document[name]["weights"] = np.random.default_rng(1).normal(0, 0.05, len(terms(len(FEATURES)))).tolist()
+        document[name]["terms"] = [
+            {"feature": feature, "knots": [-4.0, 4.0], "log_odds": [-4 * weight, 4 * weight]}
+            for feature, weight in zip(FEATURES, weights, strict=True)
+        ]
     folder = tmp_path_factory.mktemp("mixed") / "tiny"
     write_bundle(folder, content_of(calibration=document))
     engine = Engine.open(Settings(maps=(folder,), threads=1))
@@ -57,40 +60,55 @@ def depths_of(depth_m: NDArray[np.float32]) -> dict[str, NDArray[np.float32]]:
     few = np.zeros_like(depth_m)
     few[20:23, 20:24] = depth_m[20:23, 20:24]
     return {
-        "exact": depth_m, "noisy": (1 / np.maximum(1 / depth_m + noise, 1e-2)).astype(np.float32),
-        "millimetres": (np.round(depth_m, 3)).astype(np.float32), "constant": np.full_like(depth_m, 4.0), "too few": few,
-    }  # fmt: skip
+        "exact": depth_m,
+        "noisy": (1 / np.maximum(1 / depth_m + noise, 1e-2)).astype(np.float32),
+        "millimetres": (np.round(depth_m, 3)).astype(np.float32),
+        "constant": np.full_like(depth_m, 4.0),
+        "too few": few,
+    }
 
 
 priors = st.one_of(
     st.none(),
     st.builds(
         lambda x, y, std_m: Prior(position_m=np.array([x, y]), position_std_m=std_m),
-        st.floats(-FAR, FAR), st.floats(-FAR, FAR), st.floats(1e-3, 1e6),
+        st.floats(-FAR, FAR),
+        st.floats(-FAR, FAR),
+        st.floats(1e-3, 1e6),
     ),
     st.builds(
         lambda heading, std: Prior(heading_rad=heading, heading_std_rad=std),
-        st.floats(-2 * math.pi, 2 * math.pi), st.floats(math.radians(1e-3), 2 * math.pi),
+        st.floats(-2 * math.pi, 2 * math.pi),
+        st.floats(math.radians(1e-3), 2 * math.pi),
     ),
-)  # fmt: skip
-options = st.fixed_dictionaries({
-    "refine": st.booleans(), "neighbours": st.integers(1, 50), "false_accept_rate": st.floats(0.001, 0.999), "prior": priors,
-    "baseline_m": st.one_of(st.none(), st.floats(1e-3, 100)),
-    "down_camera": st.one_of(st.none(), st.just(np.array([0.0, 1.0, 0.0])), st.just(np.array([0.1, 0.9, 0.2]) / math.sqrt(0.86))),
-    "T_vehicle_camera": st.one_of(st.none(), st.just(transform_from(rotation_y(0.5), np.array([1e5, -1e5, 2.0])))),
-})  # fmt: skip
+)
+options = st.fixed_dictionaries(
+    {
+        "refine": st.booleans(),
+        "neighbours": st.integers(1, 50),
+        "false_accept_rate": st.floats(0.001, 0.999),
+        "prior": priors,
+        "baseline_m": st.one_of(st.none(), st.floats(1e-3, 100)),
+        "down_camera": st.one_of(
+            st.none(), st.just(np.array([0.0, 1.0, 0.0])), st.just(np.array([0.1, 0.9, 0.2]) / math.sqrt(0.86))
+        ),
+        "T_vehicle_camera": st.one_of(st.none(), st.just(transform_from(rotation_y(0.5), np.array([1e5, -1e5, 2.0])))),
+    }
+)
 depth_names = st.sampled_from(["exact", "noisy", "millimetres", "constant", "too few"])
 odometry = st.one_of(
     st.none(),
     st.builds(
         lambda x, z, turn: transform_from(rotation_y(turn), np.array([x, 0.0, z])),
-        st.floats(-3, 3), st.floats(-1e5, 1e5), st.floats(-math.pi, math.pi),
+        st.floats(-3, 3),
+        st.floats(-1e5, 1e5),
+        st.floats(-math.pi, math.pi),
     ),
-)  # fmt: skip
+)
 
 
 def require_consistent(answer: Answer, query: Any, bundle: MapBundle) -> None:
-    """Finite, and no part of it says what another denies."""
+    """Check that an answer is finite and that its parts are consistent."""
     require_finite(answer)
     assert bundle.calibration is not None
     registered = answer.covariance is not None
@@ -150,7 +168,7 @@ def test_a_stream_of_an_engine(engine: Engine, parts_of: Callable[..., dict[str,
 
 
 @pytest.mark.parametrize("first", [{"refine": False}, {"refine": False, "neighbours": 50}, {"neighbours": 1}])
-def test_what_one_frame_asks_for_does_not_change_the_next_answer(
+def test_options_of_one_frame_do_not_change_the_next_answer(
     engine: Engine, parts_of: Callable[..., dict[str, bytes]], first: dict[str, Any]
 ) -> None:
     parts, answers = parts_of(), []
@@ -169,7 +187,7 @@ def test_what_one_frame_asks_for_does_not_change_the_next_answer(
 def test_an_answer_that_is_not_finite_does_not_leave_the_core(
     localizer: Localizer, pictures: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Whatever field it stands in: the first one is named, the request is not blamed."""
+    """Holds for any field. The error names the first one, and does not blame the request."""
     rgb, depth_m, camera = pictures
     good = localizer.localize(Query(rgb=rgb, depth_m=depth_m, camera=camera, T_vehicle_camera=np.eye(4)))
     assert good.covariance is not None
@@ -202,7 +220,7 @@ def test_an_answer_that_is_not_finite_does_not_leave_the_core(
 
 
 def test_large_finite_numbers_are_no_defect(localizer: Localizer, pictures: Any) -> None:
-    """The sum of an array may overflow where no number of it is infinite."""
+    """The sum of an array may overflow although all its numbers are finite."""
     rgb, depth_m, camera = pictures
     answer = localizer.localize(Query(rgb=rgb, depth_m=depth_m, camera=camera))
     with np.errstate(over="ignore"):

@@ -1,4 +1,4 @@
-"""A mounted file that the service's user may not read."""
+"""A mounted file that the user of the service cannot read."""
 
 import os
 from pathlib import Path
@@ -14,7 +14,7 @@ from service.runtime.settings import load_settings
 
 @pytest.fixture
 def mounted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A file of this user with mode 600, as the container's user 10001 sees it."""
+    """Return a file with mode 600, owned by this user, as user 10001 of the container sees it."""
     path = tmp_path / "keys.txt"
     path.write_text("one " + 64 * "0" + "\n")
     path.chmod(0o600)
@@ -40,7 +40,7 @@ def read(what: str, path: Path) -> None:
 
 
 @pytest.mark.parametrize("what", ["keys", "certificate", "config"])
-def test_it_is_told_who_asks_whose_the_file_is_its_mode_and_what_to_do(mounted: Path, what: str) -> None:
+def test_the_error_names_user_owner_mode_and_remedy(mounted: Path, what: str) -> None:
     found = mounted.stat()
     with pytest.raises((KeysError, RequestError)) as caught:
         read(what, mounted)
@@ -51,7 +51,7 @@ def test_it_is_told_who_asks_whose_the_file_is_its_mode_and_what_to_do(mounted: 
     assert f"chmod 640 {mounted}" in told
 
 
-def test_a_folder_on_the_way_that_may_not_be_entered_is_told(mounted: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_parent_folder_without_permission_is_reported(mounted: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def refused(*_: Any, **__: Any) -> None:
         raise PermissionError(13, "Permission denied")
 
@@ -60,6 +60,6 @@ def test_a_folder_on_the_way_that_may_not_be_entered_is_told(mounted: Path, monk
         KeyRing.open(mounted)
 
 
-def test_a_file_that_is_not_there_is_told_so(tmp_path: Path) -> None:
+def test_a_missing_file_is_reported(tmp_path: Path) -> None:
     with pytest.raises(KeysError, match="No such file"):
         KeyRing.open(tmp_path / "nowhere")

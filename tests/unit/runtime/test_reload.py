@@ -12,7 +12,7 @@ from service.runtime.wakeup import Wakeup
 
 
 class Loaded:
-    """Counts, and fails when it is told to."""
+    """Counts its loads, and fails on demand."""
 
     def __init__(self) -> None:
         self.times = 0
@@ -31,7 +31,7 @@ def path(tmp_path: Path) -> Path:
     return path
 
 
-def test_what_changes_is_loaded_once(path: Path) -> None:
+def test_a_changed_file_is_loaded_once(path: Path) -> None:
     loaded, reloader = Loaded(), Reloader()
     reloader.watch("x", [path], loaded)
     reloader.look()
@@ -45,7 +45,7 @@ def test_what_changes_is_loaded_once(path: Path) -> None:
 
 
 def test_a_link_that_is_turned_counts_as_a_change(path: Path) -> None:
-    """So does Kubernetes replace the files of a secret, all at once."""
+    """Kubernetes replaces all files of a secret at once in this way."""
     (path.parent / "old").mkdir()
     (path.parent / "new").mkdir()
     for name in ("old", "new"):
@@ -62,7 +62,7 @@ def test_a_link_that_is_turned_counts_as_a_change(path: Path) -> None:
 
 
 @pytest.mark.parametrize("error", [KeysError("the key file is empty"), OSError("broken")])
-def test_what_cannot_be_used_is_logged_once_and_tried_again_when_it_changes(
+def test_an_unusable_file_is_logged_once_and_retried_when_it_changes(
     path: Path, caplog: pytest.LogCaptureFixture, error: Exception
 ) -> None:
     loaded, reloader = Loaded(), Reloader()
@@ -80,7 +80,7 @@ def test_what_cannot_be_used_is_logged_once_and_tried_again_when_it_changes(
     assert loaded.times == 2
 
 
-def test_a_file_that_is_gone_and_comes_back_is_loaded(path: Path) -> None:
+def test_a_file_that_disappears_and_returns_is_loaded(path: Path) -> None:
     loaded, reloader = Loaded(), Reloader()
     reloader.watch("x", [path], loaded)
     path.unlink()
@@ -92,7 +92,7 @@ def test_a_file_that_is_gone_and_comes_back_is_loaded(path: Path) -> None:
     assert loaded.times == 2
 
 
-def test_what_cannot_be_used_at_first_is_the_callers(path: Path) -> None:
+def test_an_unusable_file_at_the_start_is_an_error_for_the_caller(path: Path) -> None:
     loaded = Loaded()
     loaded.error = KeysError("bad")
     with pytest.raises(KeysError):
@@ -113,7 +113,7 @@ def test_one_that_fails_does_not_keep_the_others_back(path: Path, tmp_path: Path
 
 
 def test_a_signal_that_comes_just_after_a_wait_has_timed_out_is_not_lost(path: Path) -> None:
-    """It asks for all files, also those that look unchanged."""
+    """The signal requests all files, also those that look unchanged."""
 
     class SignalledLate(Wakeup):
         waits = 0

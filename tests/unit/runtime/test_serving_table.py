@@ -1,4 +1,4 @@
-"""Rules of the table, with workers that are objects of one process; and the real thing, with processes that are killed."""
+"""Rules of the serving table, with workers as objects of one process, and with real processes that are killed."""
 
 import mmap
 import random
@@ -29,7 +29,7 @@ def joined(memory: Any, number: int, *opened: MapVersion) -> SharedServingTable:
 
 
 def mounted(table: ServingTable, name: str = "m") -> tuple[str, list[str]]:
-    """What serves, and what may be asked."""
+    """Return the serving version, and the mounted versions."""
     known = table.read().maps[name]
     return known.serving, [each.version for each in known.versions]
 
@@ -52,7 +52,7 @@ def test_a_version_is_mounted_when_every_worker_has_it(memory: Any) -> None:
     assert not any(tables[0].read().offers.values())
 
 
-def test_a_worker_that_has_ended_has_no_say(memory: Any) -> None:
+def test_a_worker_that_has_ended_does_not_count(memory: Any) -> None:
     tables = [joined(memory, number, V1) for number in range(2)]
     tables[0].offer(V2)
     memory.living.remove(1)
@@ -91,7 +91,7 @@ def test_and_keeps_a_choice_that_still_holds(memory: Any) -> None:
     assert mounted(joined(memory, 1, V1, V2))[0] == "v1"
 
 
-def test_what_it_offered_before_it_ended_does_not_count(memory: Any) -> None:
+def test_offers_of_an_ended_worker_do_not_count(memory: Any) -> None:
     tables = [joined(memory, number, V1) for number in range(2)]
     tables[1].offer(V2)
     again = SharedServingTable(memory, 1)  # nobody noticed that it had ended
@@ -100,7 +100,7 @@ def test_what_it_offered_before_it_ended_does_not_count(memory: Any) -> None:
     assert mounted(tables[0])[0] == "v1"
 
 
-def test_what_serves_and_cannot_be_opened_keeps_a_worker_out(memory: Any) -> None:
+def test_a_worker_that_cannot_open_the_serving_version_does_not_join(memory: Any) -> None:
     first = joined(memory, 0, V1, V2, V3)
     first.choose("m", "v1")
     late = SharedServingTable(memory, 1)
@@ -113,7 +113,7 @@ def test_what_serves_and_cannot_be_opened_keeps_a_worker_out(memory: Any) -> Non
     assert mounted(first) == mounted(late) == ("v2", ["v3", "v2"])
 
 
-def test_what_does_not_serve_and_cannot_be_opened_is_dropped_for_all(memory: Any) -> None:
+def test_a_version_that_does_not_serve_and_cannot_be_opened_is_dropped_for_all(memory: Any) -> None:
     first = joined(memory, 0, V1, V2)
     late = SharedServingTable(memory, 1)
     assert late.join([V2]) == {V1}
@@ -177,7 +177,7 @@ def test_versions_of_one_moment_are_in_one_order_for_all(memory: Any, other_memo
 @pytest.mark.parametrize(
     ("name", "number", "told"), [("x", "v1", "mounted maps: m"), ("m", "v9", "mounted versions: v2, v1")]
 )
-def test_what_is_not_mounted_cannot_be_chosen(memory: Any, name: str, number: str, told: str) -> None:
+def test_a_version_that_is_not_mounted_cannot_be_chosen(memory: Any, name: str, number: str, told: str) -> None:
     table = joined(memory, 0, V1, V2)
     with pytest.raises(UnknownMapError, match=told):
         table.choose(name, number)
@@ -227,8 +227,13 @@ def test_all_answers_agree_while_workers_are_killed_and_versions_come_are_chosen
     seed = str(random.randrange(2**32))  # noqa: S311  # no secret
     done = subprocess.run(
         [sys.executable, str(Path(__file__).with_name("agreeing_workers.py")), str(tmp_path), "40", seed],
-        env={"PYTHONPATH": str(ROOT), "PATH": ""}, cwd=tmp_path, capture_output=True, text=True, timeout=300, check=False,
-    )  # fmt: skip
+        env={"PYTHONPATH": str(ROOT), "PATH": ""},
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        timeout=300,
+        check=False,
+    )
     assert (done.returncode, done.stderr) == (0, ""), f"seed {seed}: {done.stdout[:2000]}"
     answers, _, switches, *_ = done.stdout.split()
     assert int(answers) > 400

@@ -10,7 +10,7 @@ from service.runtime.environment import require_known, setting_names
 from service.runtime.settings import Limits, Settings, load_settings
 
 
-def test_the_service_binds_to_loopback_unless_told_otherwise() -> None:
+def test_the_service_binds_to_loopback_by_default() -> None:
     assert Settings().host == "127.0.0.1"
 
 
@@ -70,8 +70,13 @@ def test_the_environment_may_name_the_file(file: Path, monkeypatch: pytest.Monke
 
 @pytest.mark.parametrize(
     ("text", "says"),
-    [("prot = 1", "setting prot"), ("port = 70000", "setting port"), ("port 9000", "streetfix.toml"), (None, "streetfix.toml")],
-)  # fmt: skip
+    [
+        ("prot = 1", "setting prot"),
+        ("port = 70000", "setting port"),
+        ("port 9000", "streetfix.toml"),
+        (None, "streetfix.toml"),
+    ],
+)
 def test_a_file_that_makes_no_sense_is_refused_with_what_is_wrong(file: Path, text: str | None, says: str) -> None:
     file.unlink()
     if text is not None:
@@ -109,8 +114,9 @@ def test_a_variable_that_is_near_nothing_is_refused_and_its_value_not_shown(monk
 
 
 @pytest.mark.parametrize(
-    "name", ["STREETFIX_CLIENT_CA", "STREETFIX_CLIENT_ANYTHING", "STREETFIX_MAPS_FOLDER", "STREETFIX", "STREETFIXED_THREDS"]
-)  # fmt: skip
+    "name",
+    ["STREETFIX_CLIENT_CA", "STREETFIX_CLIENT_ANYTHING", "STREETFIX_MAPS_FOLDER", "STREETFIX", "STREETFIXED_THREDS"],
+)
 def test_variables_of_other_programs_are_left_alone(monkeypatch: pytest.MonkeyPatch, name: str) -> None:
     monkeypatch.setenv(name, "1")
     assert load_settings().threads is None
@@ -126,7 +132,7 @@ def test_variables_of_other_programs_are_left_alone(monkeypatch: pytest.MonkeyPa
         ("STREETFIX_STREETFIX_PORT_50051_TCP", "tcp://10.0.0.1:50051"),
     ],
 )
-def test_what_kubernetes_injects_is_recognised(monkeypatch: pytest.MonkeyPatch, name: str, value: str) -> None:
+def test_variables_of_kubernetes_are_recognised(monkeypatch: pytest.MonkeyPatch, name: str, value: str) -> None:
     monkeypatch.setenv(name, value)
     with pytest.raises(RequestError, match=f"{name}.*enableServiceLinks: false"):
         load_settings()
@@ -147,9 +153,11 @@ def test_the_clients_key_is_not_taken_for_the_services_keys(monkeypatch: pytest.
 
 @pytest.mark.parametrize(
     ("text", "says"),
-    [("threds = 7", r"threds: there is no such setting \(did you mean threads\?\)"),
-     ("[limits]\nmax_pixel = 7", r"limits.max_pixel: there is no such setting \(did you mean limits.max_pixels\?\)")],
-)  # fmt: skip
+    [
+        ("threds = 7", r"threds: there is no such setting \(did you mean threads\?\)"),
+        ("[limits]\nmax_pixel = 7", r"limits.max_pixel: there is no such setting \(did you mean limits.max_pixels\?\)"),
+    ],
+)
 def test_a_misspelt_line_of_the_file_is_refused_with_the_nearest_name(file: Path, text: str, says: str) -> None:
     file.write_text(text)
     with pytest.raises(RequestError, match=says):
@@ -171,7 +179,7 @@ def test_allowed_hosts_are_joined_by_commas(monkeypatch: pytest.MonkeyPatch) -> 
 
 
 def test_every_number_has_a_least_and_a_most() -> None:
-    """An endless timeout, or a limit that gRPC's 32 bits do not hold, would fail at the first request."""
+    """An infinite timeout, or a limit beyond 32 bits, would fail at the first request."""
 
     def bounds_of(model: type[BaseModel]) -> Iterator[tuple[str, set[str]]]:
         for name, field in model.model_fields.items():

@@ -1,4 +1,4 @@
-"""Registries and watchers of several workers on the same folder; the workers are objects of one process."""
+"""Registries and watchers of several workers on the same folder. Workers are objects of one process."""
 
 import os
 import shutil
@@ -73,7 +73,7 @@ def test_a_new_version_serves_in_all_workers_when_the_last_has_opened_it(start: 
 
 
 def test_a_worker_opens_what_another_one_has_found(start: Start, write: Write) -> None:
-    """So that a signal that reaches one of them alone, or one that looks late, keeps nobody waiting."""
+    """So no worker waits for another that got the signal alone, or that looks late."""
     workers = [start(number) for number in range(2)]
     workers[1].watcher.start(3600)
     until(lambda: workers[1].registry.table.others_offer() == frozenset())
@@ -83,8 +83,8 @@ def test_a_worker_opens_what_another_one_has_found(start: Start, write: Write) -
     workers[1].watcher.stop()
 
 
-def test_what_failed_in_one_worker_for_a_while_is_tried_again_as_the_others_wait(start: Start, write: Write) -> None:
-    """Its memory was full, or a network disk was away: the files are as they were, so no change of theirs says to try again."""
+def test_a_temporary_failure_in_one_worker_is_retried_while_the_others_wait(start: Start, write: Write) -> None:
+    """Its memory was full, or a network disk was missing. The files did not change, so only a retry can succeed."""
     workers = [start(number) for number in range(2)]
     failures = []
 
@@ -105,7 +105,7 @@ def test_what_failed_in_one_worker_for_a_while_is_tried_again_as_the_others_wait
     workers[1].watcher.stop()
 
 
-def test_a_roll_back_to_a_version_whose_folder_is_gone_holds_in_all_workers(
+def test_a_rollback_to_a_version_without_a_folder_holds_in_all_workers(
     start: Start, write: Write, folder: Path
 ) -> None:
     write(1)
@@ -143,7 +143,7 @@ def test_it_opens_what_is_mounted_first_and_what_is_new_later(start: Start, writ
     assert (late.opened, late.serving) == (["v0", "v1"], "v1")
 
 
-def test_it_waits_while_the_others_serve_what_it_cannot_open(
+def test_it_waits_while_the_others_serve_a_version_that_it_cannot_open(
     start: Start, write: Write, folder: Path, memory: Any, caplog: pytest.LogCaptureFixture
 ) -> None:
     write(1)
@@ -168,7 +168,7 @@ def test_it_waits_while_the_others_serve_what_it_cannot_open(
 def test_the_damage_of_a_bundle_keeps_no_worker_from_coming_back(
     start: Start, write: Write, folder: Path, memory: Any
 ) -> None:
-    """It has served before: what would end a first start does not end this one."""
+    """The map has served before. The defect would end a first start, but not this one."""
     workers = [start(number) for number in range(2)]
     for worker in workers:
         shutil.rmtree(folder / "v0", ignore_errors=True)
@@ -180,8 +180,10 @@ def test_the_damage_of_a_bundle_keeps_no_worker_from_coming_back(
     assert len(again.registry) == 0
 
 
-def test_what_is_gone_serves_until_all_have_what_comes_instead(start: Start, write: Write, folder: Path) -> None:
-    """One SIGHUP after a bundle was replaced by another: at no moment is the map away."""
+def test_a_removed_version_serves_until_all_workers_have_its_successor(
+    start: Start, write: Write, folder: Path
+) -> None:
+    """One SIGHUP follows a replacement of the bundle. The map is never missing."""
     workers = [start(number) for number in range(2)]
     write(1)
     shutil.rmtree(folder / "v0")
@@ -193,9 +195,7 @@ def test_what_is_gone_serves_until_all_have_what_comes_instead(start: Start, wri
     assert [len(each.registry.versions("tiny")) for each in workers] == [1, 1]
 
 
-def test_what_waited_to_be_taken_out_does_not_take_out_something_else_later(
-    start: Start, write: Write, folder: Path
-) -> None:
+def test_a_pending_unmount_does_not_unmount_another_version_later(start: Start, write: Write, folder: Path) -> None:
     workers = [start(number) for number in range(2)]
     write(1)
     shutil.rmtree(folder / "v0")

@@ -1,4 +1,4 @@
-"""Every request has stage times of its own. The clock of these tests moves by a second at every reading."""
+"""Every request has its own stage times. The fake clock advances by a second at every reading."""
 
 import itertools
 from collections.abc import Callable, Iterator

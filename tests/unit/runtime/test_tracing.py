@@ -1,4 +1,4 @@
-"""Spans as a collector would get them."""
+"""Trace spans as a collector receives them."""
 
 import asyncio
 import itertools
@@ -76,7 +76,7 @@ def test_a_request_of_no_trace_is_traced_by_share(engine: Engine, share: float, 
     assert len(spans(engine, lambda client: client.get("/livez"), share=share)) == count
 
 
-def test_what_fails_is_marked_and_what_is_refused_is_not(engine: Engine, parts_of: Parts) -> None:
+def test_failures_are_marked_and_refusals_are_not(engine: Engine, parts_of: Parts) -> None:
     (refused,) = spans(engine, localize({"rgb": b"x"}))
     assert (refused.attributes["streetfix.code"], refused.status.is_ok) == ("422", True)
     engine.admission.submit = None  # type: ignore[method-assign,assignment]  # so that it raises what nobody foresaw

@@ -1,4 +1,4 @@
-"""An event that may be set by a handler that interrupts whoever sets it or waits for it."""
+"""An event that a signal handler may set while another call sets it or waits for it."""
 
 import subprocess
 import sys
@@ -31,7 +31,7 @@ print(count > 0)
 """
 
 
-def test_it_wakes_who_waits_and_is_forgotten_when_cleared() -> None:
+def test_it_wakes_a_waiting_call_until_it_is_cleared() -> None:
     event = Wakeup()
     assert not event.wait(0.0)
     event.set()

@@ -36,7 +36,7 @@ def test_of_each_place_the_best_supported_is_kept(candidate):
 
 
 @pytest.mark.parametrize(("frames", "less"), [(1, [0, 1, 4]), (4, [0, 2, 8])])
-def test_what_several_frames_agree_on_counts_by_the_root_of_their_number(candidate, frames, less):
+def test_support_gaps_grow_with_the_root_of_the_number_of_frames(candidate, frames, less):
     supports = [candidate(support, xyz=(20 * k, 0, 1.5)) for k, support in enumerate([10.0, 9.0, 6.0])]
     np.testing.assert_allclose(behind(tuple(supports), frames), less)
 

@@ -22,13 +22,13 @@ def picture(rows):
 
 
 def test_a_patch_by_hand():
-    """About their means (0, 1, 2, 5) is (-2, -1, 0, 3) and (1, 0, 1, 2) is (0, -1, 0, 1): 4 squared over 14 times 2."""
+    """(0, 1, 2, 5) minus its mean is (-2, -1, 0, 3), (1, 0, 1, 2) is (0, -1, 0, 1): 4 squared over 14 times 2."""
     one, other = picture([[0, 1], [2, 5]]), picture([[1, 0], [1, 2]])
     assert squared_correlation(one, other, SETTINGS) == pytest.approx(16 / 28)
 
 
-def test_what_is_unknown_takes_no_part():
-    """Of (1, 2, 3) and (2, 4, 9) the products about the means are 7, the squares 2 and 26."""
+def test_unknown_pixels_do_not_count():
+    """For (1, 2, 3) and (2, 4, 9), the sum of products about the means is 7, and the squares are 2 and 26."""
     one, other = picture([[1, 2], [3, np.nan]]), picture([[2, 4], [9, 1e6]])
     assert squared_correlation(one, other, SETTINGS) == pytest.approx(49 / 52)
 
@@ -40,7 +40,7 @@ def test_patches_of_which_too_little_is_known_do_not_count():
     assert squared_correlation(one[:, 2:], other[:, 2:], SETTINGS) == 0.0
 
 
-def test_what_lies_beside_whole_patches_is_left_out():
+def test_pixels_outside_whole_patches_are_left_out():
     rng = np.random.default_rng(0)
     one, other = rng.normal(size=(2, 7, 9)).astype(np.float32)
     inner = squared_correlation(one[:6, :8], other[:6, :8], SETTINGS)
@@ -57,14 +57,14 @@ def test_neither_scale_nor_sign_nor_level_matters(seed, scale, level, sign):
     assert squared_correlation(one, changed, SETTINGS) == pytest.approx(plain, abs=2e-3)
 
 
-def test_a_flat_patch_tells_nothing():
+def test_a_flat_patch_carries_no_information():
     rng = np.random.default_rng(1)
     noise = (0.001 * rng.normal(size=(8, 8))).astype(np.float32)
     assert squared_correlation(noise, noise, replace(SETTINGS, flat=0.05)) < 1e-6
 
 
-def test_the_small_picture_covers_what_its_blocks_cover():
-    """Black, but for the last column, which makes no whole block."""
+def test_the_small_image_covers_the_same_area_as_its_blocks():
+    """The image is black except for the last column, which fills no block."""
     rgb = np.zeros((4, 9, 3), np.uint8)
     rgb[:, 8] = 255
     camera = PinholeCamera(4, 2, 4.0, 4.0, 1.5, 0.5)
@@ -74,7 +74,7 @@ def test_the_small_picture_covers_what_its_blocks_cover():
 
 @pytest.fixture(scope="module")
 def painted(scene_of):
-    """A wall 8 m ahead with posters, dark and bright, and what a camera before it sees of them."""
+    """Return a wall 8 m ahead with dark and bright posters, and the image of a camera in front of it."""
     cloud = scene_of(((8, -12, -2), (0, 24, 0), (0, 0, 8))).survey(per_m2=400.0)
     across, up = (cloud.surfels["xyz"] + cloud.origin_m)[:, 1:].T
     paint = np.random.default_rng(5).uniform(0.1, 1.0, (12, 32))
@@ -84,8 +84,8 @@ def painted(scene_of):
 
 def seen(paint, T_map_camera):
     rays = CAMERA.rays_of_pixels() @ T_map_camera[:3, :3].T
-    met = T_map_camera[:3, 3] + rays * ((8 - T_map_camera[0, 3]) / rays[..., :1])
-    row, column = ((met[..., 2] + 2) / 0.75).astype(int), ((met[..., 1] + 12) / 0.75).astype(int)
+    surfel_of = T_map_camera[:3, 3] + rays * ((8 - T_map_camera[0, 3]) / rays[..., :1])
+    row, column = ((surfel_of[..., 2] + 2) / 0.75).astype(int), ((surfel_of[..., 1] + 12) / 0.75).astype(int)
     level = np.where((row >= 0) & (row < 12), paint[row.clip(0, 11), column.clip(0, 31)], 0.5)
     return np.repeat((255 * (1.1 - level)).astype(np.uint8)[..., None], 3, axis=2)  # what reflects is dark to the eye
 
@@ -95,12 +95,12 @@ def told(cloud, rgb, T_map_camera):
     T[:3, 3] -= cloud.origin_m
     grey = grey_of(rgb, CAMERA, (1.0, 1.0), PATCHES)
     return agreement_of_brightness(
-        cloud.brightness, SurfelRaycaster(cloud, DiscSettings()).meet(T, CAMERA), grey, PATCHES
+        cloud.brightness, SurfelRaycaster(cloud, DiscSettings()).intersect(T, CAMERA), grey, PATCHES
     )
 
 
 @pytest.mark.parametrize("aside_m", [-3.0, -1.0, -0.5, 0.5, 1.0, 3.0])
-def test_a_wall_whose_depth_is_alike_everywhere_is_told_by_its_paint(painted, aside_m):
+def test_brightness_decides_along_a_wall_of_uniform_depth(painted, aside_m):
     cloud, paint = painted
     rgb, elsewhere = seen(paint, TRUE), TRUE.copy()
     elsewhere[1, 3] += aside_m
@@ -122,7 +122,7 @@ def test_the_sensors_unit_does_not_matter(painted):
 
 
 @pytest.mark.parametrize("brightness", [0.0, np.nan])
-def test_a_map_that_knows_no_brightness_says_nothing(painted, brightness):
+def test_a_map_without_brightness_scores_zero(painted, brightness):
     cloud, paint = painted
     blank = np.full(len(cloud.surfels), brightness, np.float32)
     assert told(replace(cloud, brightness=blank), seen(paint, TRUE), TRUE) == 0.0

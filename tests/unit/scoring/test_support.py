@@ -19,7 +19,7 @@ PRIOR = Prior(position_m=np.array([4.0, 0.0]), position_std_m=3.0, heading_rad=0
 
 
 class HeightScorer:
-    """A scorer as a contributor would add one: the height of the camera, and its double as a detail."""
+    """A scorer as a contributor would write it: the height of the camera, and its double as a detail."""
 
     name = "height"
 
@@ -50,21 +50,21 @@ def brightness(street_map, measured):
 
 @pytest.fixture
 def candidates_of(measured, brightness, poses):
-    """The candidates of the three poses by scorers and their weights."""
+    """Return the candidates of three poses, for scorers and their weights."""
     return lambda *scorers: PoseScorer(measured, scorers, brightness, SupportWeights(), LocalScoreWeights()).candidates(
         poses
     )
 
 
 def test_a_new_scorer_needs_a_line_in_the_list_and_nothing_else(candidates_of, poses):
-    """Ten times 0.9, 0.5 and 0.7 and twice 1, 2 and 3: 11, 9 and 13."""
+    """Ten times 0.9, 0.5 and 0.7, plus twice 1, 2 and 3: 11, 9 and 13."""
     found = candidates_of((InlierScorer(), 10.0), (HeightScorer(), 2.0))
     assert [each.support for each in found] == pytest.approx([13.0, 11.0, 9.0])
     assert [each.registered for each in found] == [poses[2], poses[0], poses[1]]
     assert dict(found[0].scores) == pytest.approx({"inliers": 0.7, "height": 3.0, "twice": 6.0})
 
 
-def test_a_scorer_of_weight_zero_is_told_and_does_not_count(candidates_of):
+def test_a_scorer_of_weight_zero_is_listed_and_has_no_effect(candidates_of):
     plain = candidates_of((InlierScorer(), 10.0))
     beside = candidates_of((InlierScorer(), 10.0), (HeightScorer(), 0.0))
     assert [each.support for each in beside] == [each.support for each in plain]

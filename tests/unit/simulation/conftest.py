@@ -14,12 +14,16 @@ from model_training.simulation.terrain import GroundPicture
 
 
 def make_plan(**changed) -> SimulationPlan:
-    """Two dozen scans and six picture pairs of a city of five short streets."""
+    """Return a plan of two dozen scans and six image pairs, in a city of five short streets."""
     query = QueryPlan(name="drive1", traversal=1, count=6, depths=("precise", "stereo"))
     given = {
-        "name": "tiny", "seed": 3, "size_m": (60.0, 60.0), "spacing_m": 12.0, "camera": CameraPlan(width=96, height=72),
+        "name": "tiny",
+        "seed": 3,
+        "size_m": (60.0, 60.0),
+        "spacing_m": 12.0,
+        "camera": CameraPlan(width=96, height=72),
         "queries": (query,),
-    }  # fmt: skip
+    }
     return SimulationPlan(**(given | changed))
 
 
@@ -42,7 +46,7 @@ def city() -> City:
 
 @pytest.fixture(scope="session")
 def wall() -> SimpleNamespace:
-    """One matte wall, 200 m wide and 100 m high, square to x, its face at x = 20 m; and a ground picture for shading."""
+    """Return one matte wall, 200 m wide and 100 m high, perpendicular to x at x = 20 m, and a ground image for shading."""
     builder = MeshBuilder()
     builder.box(np.array([21.0, 0.0, -50.0]), (2.0, 200.0, 100.0), 0.0, np.full(3, 0.5), Material.MATTE)
     return SimpleNamespace(

@@ -27,9 +27,18 @@ def picture_of(wall, condition_name="clear", *, seed=0, T_map_camera=None, block
     rays, z = unit_rays(CAMERA)
     light = Light.of(condition, np.random.default_rng(seed))
     return take(
-        wall.scene, wall.ground, CAMERA, pose() if T_map_camera is None else T_map_camera, light, condition, model,
-        np.random.default_rng(seed), rays_camera=rays, z_of_ray=z, blocker=blocker,
-    )  # fmt: skip
+        wall.scene,
+        wall.ground,
+        CAMERA,
+        pose() if T_map_camera is None else T_map_camera,
+        light,
+        condition,
+        model,
+        np.random.default_rng(seed),
+        rays_camera=rays,
+        z_of_ray=z,
+        blocker=blocker,
+    )
 
 
 def test_depth_of_a_wall_square_to_the_axis_is_its_distance(wall):
@@ -52,7 +61,7 @@ def test_matte_walls_are_blank_to_stereo_and_the_sky_is_not(wall):
 
 
 def linear_light(wall, condition_name, azimuth_deg, *, x_m):
-    """Light from the wall at an azimuth off the optical axis."""
+    """Return the linear light from the wall at an azimuth off the optical axis."""
     azimuth = np.deg2rad(azimuth_deg)
     rays = np.array([[np.cos(azimuth), np.sin(azimuth), 0.0]], np.float32)
     origin, condition = np.array([x_m, 0.0, 1.5]), CONDITIONS[condition_name]
@@ -81,8 +90,8 @@ def test_headlights_light_what_is_near_and_ahead(wall):
     assert near > 20 * linear_light(wall, "night", 40.0, x_m=14.0)
 
 
-def test_fog_pales_what_is_far(wall):
-    """At a distance beyond the visibility the wall takes the colour of the air."""
+def test_fog_brightens_distant_surfaces(wall):
+    """At a distance beyond the visibility, the wall has the colour of the air."""
     light = Light.of(CONDITIONS["fog"], np.random.default_rng(0))
     assert linear_light(wall, "fog", 0.0, x_m=-60.0) == pytest.approx(float(light.horizon.mean()), rel=0.02)
 
@@ -106,7 +115,7 @@ def test_a_shadow_falls_away_from_the_sun():
 
 
 def columns_behind(blocker, T_map_camera):
-    """Share of the view grid's columns that the body stops at the height of the camera."""
+    """Return the share of the columns of the view grid that the body blocks at camera height."""
     azimuths = GRID.azimuths_rad
     rays_level = np.stack([np.cos(azimuths), np.sin(azimuths), np.zeros(len(azimuths))], axis=1)
     R_map_level = T_map_camera[:3, :3] @ R_BODY_OPTICAL.T
@@ -169,7 +178,7 @@ def test_a_stop_more_is_brighter_by_as_much_as_twice_the_light(preset):
         )
 
 
-def test_noise_is_what_is_asked_for():
+def test_noise_has_the_requested_size():
     quiet = exposed(
         grey(0.3, (200, 200)), RgbParameters(noise=0, noise_per_gain=0).on("automatic"), CLEAR, np.random.default_rng(1)
     )
@@ -181,7 +190,7 @@ def test_noise_is_what_is_asked_for():
     assert 8.0 < loud[..., 0].std() < 8.0 * (1 + 0.5**2) ** 0.5
 
 
-def test_the_sun_stands_where_it_is_told_to():
+def test_the_sun_has_the_given_direction():
     light = Light.of(CLEAR, np.random.default_rng(0), elevation_deg=30.0, azimuth_deg=90.0)
     np.testing.assert_allclose(light.toward_sun, [0.0, np.cos(np.pi / 6), 0.5], atol=1e-12)
 
@@ -192,7 +201,7 @@ def test_telling_the_sun_draws_no_other_clouds():
 
 
 def test_a_machine_vision_camera_answers_in_proportion_and_clips():
-    """Display value 0.26 * 1.6 for what metering brings to 0.26; noise of about one value."""
+    """Display value 0.26 * 1.6 for the metered value 0.26, with noise of about one grey level."""
     quiet = RgbParameters(noise=0.0, noise_per_gain=0.0).on("machine")
     light = grey(0.1)
     light[:, ::2] = 0.2
@@ -216,7 +225,7 @@ def test_a_machine_vision_camera_has_more_contrast_than_one_that_maps_tones():
 
 
 def test_shade_is_darker_in_hard_light():
-    """A wall that faces away from the sun has the sky's light alone, of which there is 0.45 of a clear day's."""
+    """A wall that faces away from the sun gets only light of the sky, 0.45 of that of a clear day."""
     rng = [np.random.default_rng(3) for _ in range(2)]
     clear, hard = (Light.of(CONDITIONS[name], each) for name, each in zip(("clear", "hard_light"), rng, strict=True))
     np.testing.assert_allclose(hard.sky, 0.45 * clear.sky, rtol=1e-5)

@@ -101,10 +101,13 @@ def test_no_house_stands_on_a_carriageway(city):
 
 
 def test_slopes_are_gentle_and_there_are_some():
-    normals = np.array([
-        Terrain.random(np.random.default_rng(seed)).normal(xy)
-        for seed in range(20) for xy in np.random.default_rng(seed).uniform(-200, 200, (20, 2))
-    ])  # fmt: skip
+    normals = np.array(
+        [
+            Terrain.random(np.random.default_rng(seed)).normal(xy)
+            for seed in range(20)
+            for xy in np.random.default_rng(seed).uniform(-200, 200, (20, 2))
+        ]
+    )
     slopes = np.rad2deg(np.arccos(normals[:, 2]))
     assert slopes.max() < 4.0
     assert np.median(slopes) > 0.3
@@ -120,7 +123,7 @@ def test_the_normal_of_the_ground_is_square_to_it():
 
 @pytest.fixture
 def stood(city, monkeypatch):
-    """Where people and vehicles of a traversal stand, instead of their triangles."""
+    """Return the positions of people and vehicles of a traversal, instead of their triangles."""
 
     def of(traversal, **options):
         people, vehicles = [], []
@@ -134,7 +137,7 @@ def stood(city, monkeypatch):
     return of
 
 
-def test_nobody_stands_twice_at_the_same_spot(stood):
+def test_no_two_people_stand_at_the_same_spot(stood):
     assert not stood(0)[0] & stood(1)[0]
     assert not stood(1)[0] & stood(2)[0]
     assert len(stood(0)[0]) > 3
@@ -156,7 +159,7 @@ def test_the_same_traversal_has_the_same_occupants(city):
 
 
 class CarParks(City):
-    """A city of nothing else."""
+    """A city of car parks only."""
 
     def _districts(self, rng):
         seeds, kinds = super()._districts(rng)
@@ -186,7 +189,7 @@ def test_other_cities_have_the_first_three_kinds_alone():
 
 
 def test_cars_of_a_car_park_stand_in_rows_beyond_the_pavement(car_parks):
-    """Elsewhere cars park on the carriageway, whose clearance is negative."""
+    """Elsewhere cars park on the carriageway, with a negative clearance."""
     clearance = np.array([car_parks.clearance(np.array([[x, y]])) for x, y, *_ in car_parks._parking])
     beyond = clearance > 4.0
     assert beyond.sum() > 20

@@ -18,7 +18,7 @@ QUERY = QueryPlan(name="a", traversal=1, count=100)
 
 
 def offsets(city, plan, query):
-    """Of every candidate: metres aside and ahead of the station it belongs to, degrees off the street (either way)."""
+    """Return for every candidate the lateral and longitudinal offset from its station (m) and the yaw offset (degrees)."""
     survey = survey_of(city, plan)
     candidates = query_candidates(city, plan, query, survey)
     order = np.random.default_rng([plan.seed, 22, query.traversal, 0]).permutation(len(survey.stations))
@@ -111,7 +111,7 @@ def test_only_the_wanted_streets_are_driven(city, plan):
     assert len(part) < len(driven(city, plan, 1.0))
 
 
-def test_stations_of_some_streets_are_those_of_the_whole_drive_counted_anew(city, plan):
+def test_stations_of_some_streets_are_those_of_the_whole_drive_renumbered(city, plan):
     part = driven(city, plan.model_copy(update={"streets": ("3", "2")}), 1.0)
     whole = stations(city, 1.0)
     expected, travelled = [], 0.0
@@ -119,17 +119,17 @@ def test_stations_of_some_streets_are_those_of_the_whole_drive_counted_anew(city
         own = stations_along([street], 1.0)
         if street.street in ("2", "3"):
             first = next(k for k, s in enumerate(whole) if (s.x, s.y) == (own[0].x, own[0].y))
-            expected += [(s.x, s.y, s.heading, travelled + o.travelled)
-                         for s, o in zip(whole[first : first + len(own)], own, strict=True)]  # fmt: skip
+            expected += [
+                (s.x, s.y, s.heading, travelled + o.travelled)
+                for s, o in zip(whole[first : first + len(own)], own, strict=True)
+            ]
             travelled += sum(float(np.linalg.norm(np.diff(line, axis=0), axis=1).cumsum()[-1]) for line in street.lines)
     assert [(s.x, s.y, s.heading, s.travelled) for s in part] == expected
 
 
 def test_the_lidar_stands_upright_on_the_slope_but_for_its_sway(city, plan):
     survey = survey_of(city, plan)
-    tilts = [
-        np.rad2deg(np.arccos(min(1.0, T[:3, 2] @ city.terrain.normal(T[:2, 3])))) for T in survey.T_map_lidar
-    ]  # fmt: skip
+    tilts = [np.rad2deg(np.arccos(min(1.0, T[:3, 2] @ city.terrain.normal(T[:2, 3])))) for T in survey.T_map_lidar]
     assert 0.2 < np.mean(tilts) < 0.8
     turns = [heading_of_body(T) - s.heading for T, s in zip(survey.T_map_lidar, survey.stations, strict=True)]
     assert np.abs(np.angle(np.exp(1j * np.array(turns)))).max() < np.deg2rad(0.3)
@@ -165,10 +165,8 @@ def test_a_street_that_is_not_there_is_refused_with_those_that_are(city, plan):
 
 @pytest.mark.parametrize(("step_m", "expected_m"), [(None, 2.0), (3.5, 3.5)])
 @pytest.mark.parametrize("turn_deg", [0.0, 90.0, -30.0])
-def test_frames_of_a_sequence_follow_a_straight_line_to_the_pose_that_was_drawn(
-    city, plan, step_m, expected_m, turn_deg
-):
-    """Two metres apart unless told otherwise; the vehicle drives where it heads, wherever the camera looks."""
+def test_frames_of_a_sequence_follow_a_straight_line_to_the_sampled_pose(city, plan, step_m, expected_m, turn_deg):
+    """Frames are two metres apart by default. The vehicle drives along its heading for any camera direction."""
     query = QUERY.model_copy(update={"sequence": 4, "step_m": step_m, "turn_deg": turn_deg})
     poses = query_candidates(city, plan, query, survey_of(city, plan))[:25]
     frames = followed(city, query, poses).reshape(25, 4, 4, 4)

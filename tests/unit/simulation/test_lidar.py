@@ -19,7 +19,7 @@ def scan_of(wall, model=MODEL, condition=CLEAR, *, seed=0, at_x_m=0.0):
 
 
 def along(points, wall, at_x_m=0.0):
-    """Errors of ranges along their beams: the wall stands at a known x."""
+    """Return range errors along the beams. The wall is at a known x."""
     ranges = np.linalg.norm(points[:, :3], axis=1)
     return ranges - (wall.x_m - at_x_m) * ranges / points[:, 0]
 
@@ -82,7 +82,7 @@ def elevations_deg(model):
 
 
 def test_beams_of_a_table_are_where_the_manual_has_them():
-    """Two blocks of 32: a third of a degree apart from +2, half a degree apart from -8.83."""
+    """Two blocks of 32: spacing 1/3 degree from +2 degrees, 1/2 degree from -8.83 degrees."""
     beams = elevations_deg(LIDARS["hdl_64"])
     np.testing.assert_allclose(beams[[0, 1, 31, 32, 33, 63]], [2, 1.6667, -8.3333, -8.83, -9.33, -24.33], atol=1e-3)
     assert (np.diff(elevations_deg(LIDARS["pandar_64"])) < 0).all()
@@ -134,6 +134,6 @@ def test_snow_gives_more_false_returns_than_rain(wall):
 
 @pytest.mark.parametrize(("name", "decibel_per_km"), [("rain", 9.3), ("snow", 14.3), ("fog", 339.8)])
 def test_extinctions_are_those_of_the_stated_strengths(name, decibel_per_km):
-    """25 mm/h: 1.076 * 25^0.67; 2 mm/h of water: 5.50 * 2^1.38; 50 m visibility: 3.912 / 50 a metre."""
+    """25 mm/h: 1.076 * 25^0.67. 2 mm/h of water: 5.50 * 2^1.38. Visibility 50 m: 3.912 / 50 per metre."""
     in_decibel = CONDITIONS[name].extinction_per_m * 1000 * 10 / np.log(10)
     assert in_decibel == pytest.approx(decibel_per_km, rel=0.01)

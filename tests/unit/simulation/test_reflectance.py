@@ -11,7 +11,7 @@ ORIGIN = np.zeros(3)
 
 
 def returns(material, grey=0.5, *, turned_deg=0.0, cover=Cover.ASPHALT, condition="clear", count=400):
-    """Mean return of beams that meet the face of a small box 10 m ahead, turned about the vertical."""
+    """Return the mean return of beams that hit a face of a small box 10 m ahead, rotated about the vertical."""
     builder = MeshBuilder()
     builder.box(np.array([10.0, 0.0, -4.0]), (0.2, 8.0, 8.0), np.deg2rad(turned_deg), np.full(3, grey), material)
     scene = Scene(builder.mesh())
@@ -25,7 +25,7 @@ def returns(material, grey=0.5, *, turned_deg=0.0, cover=Cover.ASPHALT, conditio
 
 
 def test_a_lighter_wall_of_one_paint_returns_more():
-    """Paints differ, so the mean over many is compared."""
+    """Paints differ, so the test compares means over many."""
     light, dark = (
         np.mean([returns(Material.MATTE, base + k * 0.004).mean() for k in range(20)]) for base in (0.6, 0.2)
     )

@@ -18,7 +18,7 @@ def repeating():
 
 @pytest.fixture(scope="module")
 def block_of(repeating):
-    """Triangles above the ground in the middle of a block, told from its start; trees of the blocks beside lean over its ends."""
+    """Return triangles above the ground in the middle of a block, relative to its start. Trees may extend over its ends."""
     triangles = repeating.static.triangles.astype(np.float64)
     middle, top = triangles.mean(axis=1)[:, 0], triangles[..., 2].max(axis=1)
 
@@ -35,22 +35,22 @@ def block_of(repeating):
 
 
 def away(one, other):
-    """The distance of each point of the other to the nearest of the one."""
+    """Return the distance of each point of the second to the nearest of the first."""
     return cKDTree(one).query(other)[0]
 
 
 def same(one, other):
-    """Every triangle of each has one in the other, to a millimetre."""
+    """Check that every triangle of each has an equal one in the other, within a millimetre."""
     return all(away(a, b).max() < 1e-3 for a, b in ((one, other), (other, one)))
 
 
-def test_blocks_are_alike_but_for_those_with_a_landmark(block_of):
+def test_blocks_are_equal_except_for_those_with_a_landmark(block_of):
     blocks = [block_of(number) for number in range(BLOCKS)]
     assert len(blocks[0]) > 500
     assert [k for k in range(BLOCKS) if not same(blocks[k], blocks[0])] == list(LANDMARKS)
 
 
-def test_blocks_are_alike_to_their_ends_where_those_beside_them_are(block_of):
+def test_blocks_are_equal_to_their_ends_if_their_neighbours_are(block_of):
     first, second = block_of(4, margin_m=-0.01), block_of(9, margin_m=0.0)
     assert (away(first, second) < 1e-3).mean() > 0.99
 
@@ -64,8 +64,8 @@ def test_landmarks_stand_in_the_middles_of_their_blocks():
     np.testing.assert_allclose(landmarks_m(), [-270, -90, 90, 270])
 
 
-def test_the_ground_is_alike_in_every_block_too(repeating):
-    """Away from the ends, where markings begin."""
+def test_the_ground_is_equal_in_every_block(repeating):
+    """Away from the ends, where road markings begin."""
     x, y = np.meshgrid(np.arange(0.25, BLOCK_M, 0.5), np.arange(-8, 8, 0.05))
     covers = [
         repeating.ground.at(np.stack([x.ravel() + START_M + k * BLOCK_M, y.ravel()], axis=1))
@@ -77,7 +77,7 @@ def test_the_ground_is_alike_in_every_block_too(repeating):
 
 @pytest.mark.parametrize("traversal", [0, 1, 2])
 def test_nobody_parks_and_people_stand_beside_the_carriageway(repeating, traversal):
-    """No vehicle is as low and as wide as a person; people are no higher than 2 m."""
+    """No vehicle is as low and wide as a person. People are at most 2 m high."""
     people = repeating.occupants(traversal).triangles
     assert len(people) > 0
     size = np.ptp(people.reshape(-1, 10, 3, 3).reshape(-1, 30, 3), axis=1)  # a box has ten triangles

@@ -70,7 +70,7 @@ def test_only_what_is_given_is_written():
         (StereoParameters(min_range_m=4, max_range_m=4), "bm", "stereo.max_range_m"),
     ],
 )
-def test_what_leaves_nothing_or_does_nothing_is_refused(parameters, preset, field):
+def test_parameters_without_result_or_effect_are_refused(parameters, preset, field):
     with pytest.raises(DatasetError, match=field) as refused:
         parameters.on(preset)
     assert refused.value.field == field

@@ -32,7 +32,7 @@ def pose_of(frame):
 
 
 def interrupt(folder, *patterns):
-    """Leave what a run that was stopped leaves: no description, the claim of the folder, and not all frames."""
+    """Leave the state of an interrupted run: no description, the lock of the folder, and only some frames."""
     (folder / "dataset.json").unlink()
     (folder / "simulation.done.json").rename(folder / "simulation.json")
     for pattern in patterns:
@@ -89,7 +89,7 @@ def test_a_folder_with_something_else_is_refused(plan_of, tmp_path):
     assert [path.name for path in tmp_path.iterdir()] == ["mine.txt"]
 
 
-def test_progress_is_told_to_the_end(plan_of, tmp_path):
+def test_progress_is_reported_to_the_end(plan_of, tmp_path):
     told = []
     simulate(plan_of(), tmp_path / "new", workers=1, report=lambda *event: told.append(event))
     last = {stage: (done, of) for stage, done, of in told}
@@ -108,6 +108,14 @@ def test_the_dataset_reads_back_as_one(tiny_dataset):
     assert [frame.number for frame in frames] == list(range(6))
     assert {frame.rgb().shape for frame in frames} == {(72, 96, 3)}
     assert {frame.depth_m().shape for frame in frames} == {(72, 96)}
+
+
+def test_the_description_states_the_accuracy_of_the_survey(plan_of, tiny_dataset):
+    survey = plan_of().survey_parameters.model()
+    stated = Dataset(tiny_dataset).description.survey_accuracy
+    assert stated is not None
+    expected = (survey.position_m, survey.angle_deg) if plan_of().survey_error else (0.0, 0.0)
+    assert (stated.position_std_m, stated.angle_std_deg) == expected
 
 
 def test_the_description_says_what_was_simulated(plan_of, tiny_dataset):
@@ -143,9 +151,7 @@ def test_pictures_show_what_the_scans_measured(plan_of, tmp_path):
     query = QueryPlan(name="a", traversal=0, count=4, depths=("ideal",))
     simulate(plan_of(spacing_m=4.0, survey_error=False, queries=(query,)), tmp_path / "exact", workers=1)
     dataset = Dataset(tmp_path / "exact")
-    clouds = [
-        transform_points(T, dataset.scan(k)[:, :3].astype(float)) for k, T in enumerate(dataset.survey_poses())
-    ]  # fmt: skip
+    clouds = [transform_points(T, dataset.scan(k)[:, :3].astype(float)) for k, T in enumerate(dataset.survey_poses())]
     tree = cKDTree(np.concatenate(clouds))
     for frame in dataset.queries("a_ideal"):
         depth_m = frame.depth_m()
@@ -249,8 +255,8 @@ def test_a_plan_that_names_what_is_not_there_is_refused(plan_of, tmp_path, chang
         simulate(plan_of(**changed), tmp_path / "no")
 
 
-def test_table_i_is_met_class_by_class(monkeypatch):
-    """626 queries on candidates strewn over the paper's streets, of which every third one is blocked."""
+def test_table_i_holds_class_by_class(monkeypatch):
+    """626 queries from candidates spread over the paper's streets. Every third candidate is blocked."""
     streets = paper_streets(np.random.default_rng(0))
     city: Any = type("Streets", (), {"streets_geojson": lambda _: streets_geojson(streets)})()
     rng = np.random.default_rng(1)
@@ -302,7 +308,7 @@ def test_a_sequence_out_of_bounds_is_refused(field, value):
 
 
 def test_sequences_are_written_frame_by_frame_and_as_many_as_asked_for(plan_of, tmp_path):
-    """Two sequences of three frames are six, each with its pose; the last of each is where a single picture would be."""
+    """Two sequences of three frames are six frames with poses. The last frame of each is at the pose of a single image."""
     alone, sequence = (
         QueryPlan(name="a", traversal=1, count=2),
         QueryPlan(name="a", traversal=1, count=2, sequence=3, step_m=0.5),

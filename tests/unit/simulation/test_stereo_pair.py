@@ -1,4 +1,4 @@
-"""A matched pair: what the left camera measures of a wall whose distance is known, and what an error of rectification does to it."""
+"""Stereo-matched depth of a wall at a known distance, and the effect of a rectification error."""
 
 from dataclasses import replace
 
@@ -23,7 +23,7 @@ def drawn(model, seed=0):
 
 
 def wall_pair(disparity):
-    """A textured plane square to the axis."""
+    """Return a textured plane perpendicular to the axis."""
     texture = np.random.default_rng(0).integers(0, 255, (240, 320 + disparity, 3), np.uint8)
     return texture[:, :320].copy(), texture[:, disparity:].copy()
 
@@ -46,15 +46,15 @@ def test_depth_is_focal_length_times_baseline_over_disparity(name):
     assert np.median(measured) == pytest.approx(80.0 / 8, rel=0.01)
 
 
-def test_what_is_out_of_range_is_not_measured():
+def test_values_out_of_range_are_not_measured():
     left, right = wall_pair(8)
     assert not drawn(replace(PERFECT, max_range_m=9.0)).depth(left, right).any()
     assert not drawn(replace(PERFECT, min_range_m=11.0)).depth(left, right).any()
 
 
 @pytest.mark.parametrize("seed", range(8))
-def test_an_offset_moves_what_is_far_away_by_its_size(seed):
-    """A point straight ahead at infinity lies at fx * tan(turn) in a camera that is turned about its vertical axis."""
+def test_an_offset_shifts_a_distant_point_by_its_size(seed):
+    """A camera rotated about its vertical axis sees a point at infinity straight ahead at fx * tan(angle)."""
     rig = drawn(replace(PERFECT, offset_px=2.0), seed)
     ahead = rig.T_left_right[:3, :3].T @ [0.0, 0.0, 1.0]
     moved_px = abs(CAMERA.fx * ahead[0] / ahead[2])
@@ -81,9 +81,13 @@ def pair_plan(**changed):
         name="a", traversal=1, count=2, depths=("sgbm",), stereo_parameters=StereoParameters(focal_baseline_px_m=60.0)
     )
     given = {
-        "name": "pairs", "seed": 3, "size_m": (60.0, 60.0), "spacing_m": 30.0, "camera": CameraPlan(width=240, height=160),
+        "name": "pairs",
+        "seed": 3,
+        "size_m": (60.0, 60.0),
+        "spacing_m": 30.0,
+        "camera": CameraPlan(width=240, height=160),
         "queries": (query,),
-    }  # fmt: skip
+    }
     return SimulationPlan(**(given | changed))
 
 
@@ -133,7 +137,7 @@ def query_of(**changed):
         ),
     ],
 )
-def test_what_one_rig_cannot_be_or_what_does_nothing_is_refused(queries, field):
+def test_impossible_rigs_and_options_without_effect_are_refused(queries, field):
     with pytest.raises(DatasetError) as refused:
         SimulationPlan(name="x", queries=queries).checked()
     assert refused.value.field == field

@@ -1,4 +1,4 @@
-"""A LiDAR that drives while it turns, and a vehicle ahead of it."""
+"""A LiDAR that moves while it rotates, and a vehicle ahead of it."""
 
 from dataclasses import replace
 
@@ -18,13 +18,20 @@ EXACT = replace(LIDARS["paper_32"], range_noise_m=0.0, dropout=0.0)
 
 def scan_of(wall, survey, ahead=None):
     return scan(
-        wall.scene, wall.ground, EXACT, EXACT.rays(), np.eye(4), CONDITIONS["clear"], np.random.default_rng(0),
-        survey=survey, ahead=ahead,
-    )  # fmt: skip
+        wall.scene,
+        wall.ground,
+        EXACT,
+        EXACT.rays(),
+        np.eye(4),
+        CONDITIONS["clear"],
+        np.random.default_rng(0),
+        survey=survey,
+        ahead=ahead,
+    )
 
 
 def test_the_way_within_a_turn_follows_the_azimuth():
-    """At 10 m/s a turn of 0.1 s is 1 m: half of it behind mid-turn and half ahead."""
+    """At 10 m/s a rotation of 0.1 s covers 1 m: half a metre before mid-rotation and half after."""
     rays = np.array([[1, 0, 0], [0, 1, 0], [0, -1, 0], [-1, 1e-6, 0]], np.float32)
     np.testing.assert_allclose(moved_m(rays, 10.0)[:, 0], [0.0, 0.25, -0.25, 0.5], atol=1e-3)
     assert not moved_m(rays, 10.0)[:, 1:].any()
@@ -36,7 +43,7 @@ def test_a_scan_whose_motion_was_taken_out_shows_the_wall_where_it_stands(wall):
 
 
 def test_a_scan_as_the_sensor_turned_is_off_by_the_way_it_drove(wall):
-    """A point at azimuth a was seen from 1 m * a / 2 pi further on, so it seems so much nearer."""
+    """A point at azimuth a was measured 1 m * a / 2 pi later along the path, so it appears nearer by that distance."""
     points = scan_of(wall, SurveyModel(speed_m_s=10.0, deskewed=False))
     azimuth = np.arctan2(points[:, 1], points[:, 0])
     np.testing.assert_allclose(points[:, 0], wall.x_m - azimuth / (2 * np.pi), atol=5e-3)

@@ -27,7 +27,7 @@ def road_of(
     offset: str = "",
     lanes: str = LANES,
 ) -> str:
-    """A <road> of one geometry and one lane section; by default 100 m towards east, one lane of 4 m to the left."""
+    """Return a <road> of one geometry and one lane section; by default 100 m to the east, one lane of 4 m on the left."""
     drawn = f'<geometry s="0" x="{x}" y="{y}" hdg="{hdg}" length="{length}">{geometry}</geometry>'
     return (
         f'<road id="{identity}" name="{name}" length="{length}" junction="{junction}"><link>{link}</link>'
@@ -54,7 +54,7 @@ def xodr(tmp_path: Path) -> Callable[..., Path]:
 
 @pytest.fixture
 def geojson(tmp_path: Path) -> Callable[..., Path]:
-    """Write a FeatureCollection of (geometry's type, coordinates, properties)."""
+    """Write a FeatureCollection of (geometry type, coordinates, properties)."""
 
     def write(*features: tuple[str, Any, Mapping[str, Any]], **more: Any) -> Path:
         path = tmp_path / "map.geojson"
@@ -70,7 +70,7 @@ def geojson(tmp_path: Path) -> Callable[..., Path]:
 
 @pytest.fixture
 def osm(tmp_path: Path) -> Callable[..., Path]:
-    """Write OpenStreetMap XML of ways: (longitude, latitude) of their nodes, and their tags. Nodes of one place are one."""
+    """Write OpenStreetMap XML of ways with node coordinates (longitude, latitude) and tags. Equal coordinates are one node."""
 
     def write(*ways: tuple[Sequence[tuple[float, float]], Mapping[str, str]]) -> Path:
         path = tmp_path / "map.osm"
@@ -96,7 +96,7 @@ def ulm() -> dict[str, float]:
 
 @pytest.fixture
 def dataset(tmp_path: Path) -> Callable[..., Path]:
-    """A dataset folder whose survey has scans at some places (m)."""
+    """Return a dataset folder with survey scans at given positions (m)."""
 
     def write(*places: tuple[float, float], georeference: Mapping[str, float] | None = None) -> Path:
         folder = tmp_path / "dataset"
@@ -115,7 +115,7 @@ def dataset(tmp_path: Path) -> Callable[..., Path]:
 
 @pytest.fixture
 def streets_in() -> Callable[[Path], Streets]:
-    """A dataset's streets as the service reads them."""
+    """Return the streets of a dataset as the service reads them."""
     return lambda folder: Streets.from_geojson(json.loads((folder / "streets.geojson").read_text()))
 
 

@@ -1,4 +1,4 @@
-"""CARLA's Town01, and CARLA's own reader of OpenDRIVE as the judge."""
+"""CARLA's Town01, with CARLA's own OpenDRIVE reader as the oracle."""
 
 from collections import Counter
 
@@ -13,9 +13,9 @@ from service.maps.streets import Streets
 
 @pytest.fixture
 def waypoints(town01):
-    """Road, whether in a junction, and place of points in the middle of all driving lanes.
+    """Return road, junction flag and position of points in the middle of all driving lanes.
 
-    Places in OpenDRIVE's axes: CARLA's y points the other way.
+    Positions are in the axes of OpenDRIVE: y is opposite to CARLA's y.
     """
     carla = pytest.importorskip("carla", reason="CARLA's client is not installed")
     found = carla.Map("Town01", town01.read_text()).generate_waypoints(2.0)

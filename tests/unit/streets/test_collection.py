@@ -75,7 +75,7 @@ def test_streets_that_follow_one_another_leave_no_gap(heading, along):
     assert streets.index_at(end) >= 0
 
 
-def test_a_street_within_others_is_left_out_and_told():
+def test_a_street_within_others_is_left_out_and_reported():
     collection = collection_of(
         [street_of("a", 0, 0, 50, 50), street_of("b", 10, 10, 20, 20), street_of("c", 80, 80, 80.5, 80.5)]
     )
@@ -118,7 +118,7 @@ def test_a_file_that_is_there_stays_unless_it_may_go(tmp_path):
     assert len(write_streets(path, document, replace=True)) == 1
 
 
-def test_what_the_service_would_not_read_is_not_written(tmp_path):
+def test_a_bundle_that_the_service_would_refuse_is_not_written(tmp_path):
     with pytest.raises(BundleError):
         write_streets(tmp_path / "streets.geojson", {"type": "FeatureCollection", "features": [{}]})
     assert list(tmp_path.iterdir()) == []

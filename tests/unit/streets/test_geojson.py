@@ -64,7 +64,7 @@ def test_a_polygon_that_crosses_itself_keeps_its_ground(geojson):
     assert only(geojson(("Polygon", bow, NAMED))).surface.area == pytest.approx(50)
 
 
-def test_what_is_left_out_is_counted_with_the_reason(geojson, ulm):
+def test_omitted_items_are_counted_with_the_reason(geojson, ulm):
     near = [[9.99, 48.4], [9.991, 48.4]]
     path = geojson(
         ("LineString", near, NAMED), ("LineString", near, {}), ("Point", [0, 0], NAMED), ("LineString", LINE, NAMED)
@@ -72,8 +72,10 @@ def test_what_is_left_out_is_counted_with_the_reason(geojson, ulm):
     read = read_geojson(path, frame=MapFrame(ulm))
     assert read.unnamed == 1
     assert [reason.split(",")[0] for reason in read.dropped] == [
-        "1 features have no name", "1 features have the type Point", "1 features are more than 50 km from the map's origin",
-    ]  # fmt: skip
+        "1 features have no name",
+        "1 features have the type Point",
+        "1 features are more than 50 km from the map's origin",
+    ]
 
 
 @pytest.mark.parametrize(
@@ -107,7 +109,7 @@ def test_a_defective_collection_is_refused_by_file_and_feature(geojson, features
     "text",
     ["", "{", "[]", '{"type": "Feature"}', '{"type": "FeatureCollection", "features": [NaN]}', "[" * 100_000, "\x00"],
 )
-def test_what_is_no_geojson_is_refused(tmp_path, text):
+def test_invalid_geojson_is_refused(tmp_path, text):
     (tmp_path / "map.geojson").write_text(text)
     with pytest.raises(DatasetError, match=r"map\.geojson"):
         read_geojson(tmp_path / "map.geojson")

@@ -90,7 +90,7 @@ def test_a_road_without_a_name_is_not_joined_with_one_that_is_called_like_it(xod
     assert [street.name for street in read.streets] == ["Road 7", "Road 7 (without a name)"]
 
 
-def test_a_road_without_the_lanes_asked_for_is_told(xodr, road):
+def test_a_road_without_the_requested_lanes_is_reported(xodr, road):
     pavement = f'<left><lane id="1" type="sidewalk">{WIDTH.format(2)}</lane></left>'
     read = read_opendrive(xodr(road(1), road(2, lanes=pavement)), lanes="driving")
     assert read.dropped == ("road 2 has no lane of the kind 'driving'",)
@@ -98,14 +98,16 @@ def test_a_road_without_the_lanes_asked_for_is_told(xodr, road):
 
 @pytest.fixture
 def crossing(xodr, road):
-    """Two roads and what leads from one to the other through junction 5."""
+    """Return two roads and the connections between them through junction 5."""
 
     def write(first, second, name=""):
         link = '<predecessor elementType="road" elementId="1"/><successor elementType="road" elementId="2"/>'
         return xodr(
-            road(1, name=first), road(2, name=second, x=120), road(3, x=100, length=20, junction=5, link=link, name="x"),
+            road(1, name=first),
+            road(2, name=second, x=120),
+            road(3, x=100, length=20, junction=5, link=link, name="x"),
             f'<junction id="5" name="{name}"/>',
-        )  # fmt: skip
+        )
 
     return write
 
@@ -130,7 +132,7 @@ def test_a_junction_within_one_street_is_a_part_of_it(crossing):
     assert covers(only(crossing("High Street", "High Street")).surface, shapely.box(0, 0, 220, 4))
 
 
-def test_junctions_of_the_same_streets_are_told_apart(xodr, road):
+def test_junctions_of_the_same_streets_have_distinct_names(xodr, road):
     links = '<predecessor elementType="road" elementId="1"/><successor elementType="road" elementId="2"/>'
     through = [road(k, x=300 * k, length=20, junction=k, link=links) for k in (3, 4)]
     read = read_opendrive(xodr(road(1, name="A"), road(2, name="B", y=90), *through))

@@ -9,7 +9,7 @@ from service.geometry.earth import Georeference
 
 @pytest.fixture
 def line(ulm):
-    """Places on the Earth of map coordinates (m)."""
+    """Return geodetic positions of map coordinates (m)."""
 
     def places(*points):
         return [Georeference(**ulm).to_earth(np.array([*p, 0.0]))[1::-1] for p in points]
@@ -60,14 +60,17 @@ def test_the_greater_street_comes_first_and_so_keeps_the_crossing(osm, line, rea
     assert [street.name for street in read(path).streets] == ["B 28", "A Lane"]
 
 
-def test_what_is_no_named_street_near_the_map_is_counted(osm, line, read):
+def test_ways_that_are_no_named_street_near_the_map_are_counted(osm, line, read):
     good = {"highway": "residential", "name": "Mill Lane"}
     path = osm(
-        (line((0, 0), (100, 0)), good), (line((0, 9), (50, 9)), {"highway": "residential"}),
-        (line((0, 9), (50, 9)), {"highway": "footway", "name": "Path"}), (line((0, 9), (50, 9)), {"building": "yes"}),
-        ([(0.0, 0.0), (1.0, 1.0)], good), (line((0, 9)), good),
+        (line((0, 0), (100, 0)), good),
+        (line((0, 9), (50, 9)), {"highway": "residential"}),
+        (line((0, 9), (50, 9)), {"highway": "footway", "name": "Path"}),
+        (line((0, 9), (50, 9)), {"building": "yes"}),
+        ([(0.0, 0.0), (1.0, 1.0)], good),
+        (line((0, 9)), good),
         (line((0, 0), (9, 0), (9, 9), (0, 0)), {"highway": "pedestrian", "name": "Market", "area": "yes"}),
-    )  # fmt: skip
+    )
     found = read(path)
     assert ([street.name for street in found.streets], found.unnamed) == (["Mill Lane"], 1)
     assert len(found.dropped) == 5
@@ -90,7 +93,7 @@ def test_a_file_without_named_ways_is_refused_with_the_reason(osm, line, read):
         '<!DOCTYPE a [<!ENTITY x "ha">]><osm version="0.6">&x;</osm>',
     ],
 )
-def test_what_is_no_openstreetmap_is_refused(tmp_path, read, text):
+def test_a_file_that_is_no_openstreetmap_is_refused(tmp_path, read, text):
     (tmp_path / "map.osm").write_text(text)
     with pytest.raises(DatasetError, match=r"map\.osm"):
         read(tmp_path / "map.osm")

@@ -32,7 +32,7 @@ def test_elements_attributes_and_text_are_read(file):
         ("<a>&undefined;</a>", "not valid XML"),
     ],
 )
-def test_what_is_not_plain_xml_is_refused_by_name(file, text, said):
+def test_unsafe_xml_is_refused_by_name(file, text, said):
     with pytest.raises(DatasetError, match=rf"map\.xodr: .*{said}"):
         read_xml(file(text), root="a")
 

@@ -20,14 +20,16 @@ def same(surface, expected):
     return surface.symmetric_difference(expected).area < 0.01
 
 
-def test_ends_are_as_long_as_asked_and_the_rest_lies_between():
+def test_ends_have_the_requested_length_and_the_rest_is_between():
     begin, rest, end = in_sections([street_of([(0, 0), (100, 0)])], length_m=30)
     assert same(begin.surface, shapely.box(0, -4, 30, 4))
     assert same(rest.surface, shapely.box(30, -4, 70, 4))
     assert same(end.surface, shapely.box(70, -4, 100, 4))
     assert [(s.name, s.section) for s in (begin, rest, end)] == [
-        ("Beginning of High Street", "beginning"), ("High Street", None), ("End of High Street", "end"),
-    ]  # fmt: skip
+        ("Beginning of High Street", "beginning"),
+        ("High Street", None),
+        ("End of High Street", "end"),
+    ]
 
 
 def test_a_street_of_less_than_two_lengths_is_halved():
@@ -64,8 +66,9 @@ def test_the_beginning_is_where_the_source_begins():
 @settings(max_examples=30, deadline=None)
 @given(
     st.lists(st.tuples(st.integers(-200, 200), st.integers(-200, 200)), min_size=2, max_size=6, unique=True),
-    st.floats(5, 120), st.sampled_from(["ends", "numbered"]),
-)  # fmt: skip
+    st.floats(5, 120),
+    st.sampled_from(["ends", "numbered"]),
+)
 def test_sections_cover_their_street_and_nothing_twice(points, length_m, cut):
     street = street_of(points)
     sections = in_sections([street], length_m=length_m, cut=cut)

@@ -58,7 +58,7 @@ def test_a_picture_is_drawn(run, geojson, dataset, tmp_path):
     assert len(np.unique(picture.reshape(-1, 3), axis=0)) > 3
 
 
-def test_streets_that_miss_the_survey_are_told(run, geojson, dataset):
+def test_streets_away_from_the_survey_are_reported(run, geojson, dataset):
     out = run("geojson", geojson(LINE), "--dataset", dataset((5000, 5000)))
     assert "0 of 1 places" in out
     assert "do not fit the map" in out
@@ -72,7 +72,7 @@ def test_streets_that_are_there_stay_unless_they_may_go(run, geojson, dataset):
     run("geojson", geojson(LINE), "--dataset", folder, "--replace")
 
 
-def test_degrees_in_a_georeferenced_dataset_are_metres_where_told_so(run, geojson, dataset, streets_in, ulm):
+def test_degrees_in_a_georeferenced_dataset_can_be_declared_metres(run, geojson, dataset, streets_in, ulm):
     folder = dataset((50, 0), georeference=ulm)
     run("geojson", geojson(LINE), "--dataset", folder, "--frame", "map")
     assert streets_in(folder).index_at(np.array([99.0, 3.0])) == 0
@@ -91,7 +91,7 @@ def test_degrees_in_a_georeferenced_dataset_are_metres_where_told_so(run, geojso
         (("osm",), "georeference is null"),
     ],
 )
-def test_what_makes_no_sense_is_refused_by_name(run, geojson, dataset, arguments, said):
+def test_an_invalid_combination_is_refused_by_name(run, geojson, dataset, arguments, said):
     kind, *options = arguments
     with pytest.raises(DatasetError, match=said):
         run(kind, geojson(LINE), "--dataset", dataset((50, 0)), *options)

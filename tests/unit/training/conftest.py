@@ -13,7 +13,7 @@ GRID = ViewGrid(rows=16, columns=32)
 
 @pytest.fixture(autouse=True)
 def one_thread() -> Iterator[None]:
-    """Networks this small are slower on several threads, by far on a busy machine."""
+    """Networks this small are slower on several threads, especially on a busy machine."""
     if importlib.util.find_spec("torch") is None:
         yield
         return
@@ -26,7 +26,7 @@ def one_thread() -> Iterator[None]:
 
 
 def write_pack(folder: Path, *, places: int = 60, seed: int = 0) -> Path:
-    """Places strewn over 300 m, each with a panorama of its own and one query that sees just that."""
+    """Write a pack of places spread over 300 m. Each has its own panorama and one query that shows it."""
     rng = np.random.default_rng(seed)
     coarse = rng.uniform(3, 30, (places, 4, GRID.around // 8))
     panoramas = np.repeat(np.repeat(coarse, 4, axis=1), 8, axis=2)
@@ -39,11 +39,14 @@ def write_pack(folder: Path, *, places: int = 60, seed: int = 0) -> Path:
     queries[:, :2] += rng.uniform(-0.5, 0.5, (places, 2))
     queries[:, 3] = 1.5
     arrays: dict[str, np.ndarray] = {
-        "panoramas": panoramas.astype(np.float16), "intensities": (panoramas * 8).astype(np.uint8), "places": poses,
+        "panoramas": panoramas.astype(np.float16),
+        "intensities": (panoramas * 8).astype(np.uint8),
+        "places": poses,
         "rows_seen": np.ones(GRID.rows, np.bool_),
         "ranges": np.stack([p[:, c] for p, c in zip(panoramas, columns, strict=True)]).astype(np.float16),
-        "rgb": rng.integers(0, 256, (places, GRID.rows, GRID.columns, 3)).astype(np.uint8), "queries": queries,
-    }  # fmt: skip
+        "rgb": rng.integers(0, 256, (places, GRID.rows, GRID.columns, 3)).astype(np.uint8),
+        "queries": queries,
+    }
     folder.mkdir(parents=True)
     for name, array in arrays.items():
         np.save(folder / f"{name}.npy", array)

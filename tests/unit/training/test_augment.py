@@ -12,10 +12,24 @@ GRID = ViewGrid()
 COUNT = 300
 #: Everything off.
 NOTHING = Augmentation(
-    disparity_noise_px=(1e-6, 1e-6), scale_error=0, invented_depth=0, short_range=0, no_colour=0, narrow_rows=0, narrow_columns=0,
-    blocked=0, small_blocks=0, unseen_top_rows=0, survey_noise_m=0, survey_dropout=0, height_error_m=0, no_intensity=0,
-    intensity_gain=0, no_brightness=0, shading=0,
-)  # fmt: skip
+    disparity_noise_px=(1e-6, 1e-6),
+    scale_error=0,
+    invented_depth=0,
+    short_range=0,
+    no_colour=0,
+    narrow_rows=0,
+    narrow_columns=0,
+    blocked=0,
+    small_blocks=0,
+    unseen_top_rows=0,
+    survey_noise_m=0,
+    survey_dropout=0,
+    height_error_m=0,
+    no_intensity=0,
+    intensity_gain=0,
+    no_brightness=0,
+    shading=0,
+)
 
 
 def augmenter(*, seed=0, **changed):
@@ -116,7 +130,7 @@ def test_narrow_cameras_lose_columns_at_both_sides_only():
     assert not bool(observed[:, :, 0].all())
 
 
-def test_what_is_not_observed_is_blank_in_every_plane():
+def test_unobserved_cells_are_blank_in_every_plane():
     found = query(augmenter(narrow_columns=1.0, narrow_rows=1.0))
     outside = plane(found, "observed") == 0
     assert float(found.abs().sum(dim=1)[outside].max()) == 0.0
@@ -194,7 +208,7 @@ def test_the_least_of_nine_is_what_a_pooling_gives():
     torch.testing.assert_close(least_of_nine(values), pooled, rtol=0, atol=0)
 
 
-def test_depth_of_matched_pairs_gets_no_drawn_errors():
+def test_stereo_matched_depth_gets_no_modelled_errors():
     noisy = {"disparity_noise_px": (0.5, 0.5), "scale_error": 0.05, "invented_depth": 1.0}
     ranges, rgb, height, rows = clean()
     seen = torch.ones_like(ranges, dtype=torch.bool)
@@ -204,7 +218,7 @@ def test_depth_of_matched_pairs_gets_no_drawn_errors():
     assert ((drawn - ranges).abs() > 0.1).any()
 
 
-def test_what_the_camera_does_not_see_is_not_observed():
+def test_cells_outside_the_field_of_view_are_not_observed():
     ranges, rgb, height, rows = clean()
     seen = torch.ones_like(ranges, dtype=torch.bool)
     seen[:, :, :40] = False

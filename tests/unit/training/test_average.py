@@ -34,8 +34,8 @@ def test_weights_are_the_mean_of_both_by_their_share(runs, pack_folder, tmp_path
         torch.testing.assert_close(value, (1 - share) * first[name] + share * second[name])
 
 
-def test_statistics_are_taken_anew_over_the_batches(runs, pack_folder, tmp_path):
-    """A net averaged with itself sees the same data through the same weights, so nothing but chance moves them."""
+def test_statistics_are_computed_again_over_the_batches(runs, pack_folder, tmp_path):
+    """A network averaged with itself has equal weights and data, so only random effects remain."""
     seen = []
     one = average(runs / "first", runs / "first", [pack_folder], tmp_path / "one", batches=20, report=seen.append)
     other = average(runs / "first", runs / "first", [pack_folder], tmp_path / "other", batches=20, seed=1)
@@ -57,7 +57,7 @@ def test_the_mean_is_a_run_like_any_other(runs, pack_folder, tmp_path):
     train([pack_folder], tmp_path / "third", config, device="cpu", start_from=tmp_path / "mean")
 
 
-def test_what_has_no_mean_is_refused_and_nothing_written(runs, pack_folder, tmp_path):
+def test_values_without_a_mean_are_refused_and_nothing_is_written(runs, pack_folder, tmp_path):
     with pytest.raises(DatasetError, match="must have the same shape"):
         average(runs / "first", runs / "other", [pack_folder], tmp_path / "mean")
     with pytest.raises(DatasetError, match=r"checkpoint\.pt"):

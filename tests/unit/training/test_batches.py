@@ -52,8 +52,8 @@ def test_pairs_number_the_queries_drawn(city):
     np.testing.assert_allclose(batch.query_xy.numpy(), city.pack.queries[batch.pairs, :2], rtol=1e-6)
 
 
-def test_views_are_turned_no_further_than_asked(city, grid):
-    """Each query sees just its place's panorama: how far the survey's view must be shifted says how far it is turned."""
+def test_views_are_rotated_at_most_by_the_requested_angle(city, grid):
+    """Each query shows the panorama of its place. The shift of the survey view is its yaw offset."""
     step_deg = 360.0 / grid.around
     for seed in range(2):
         batch = draw(city, pairs=8, seed=seed)
@@ -69,7 +69,7 @@ def test_views_are_turned_no_further_than_asked(city, grid):
 
 
 def offset_of(panorama, view, grid):
-    """Column of the panorama at which a view begins: the one that fits best."""
+    """Return the column of the panorama at which a view begins, by best fit."""
     columns = np.rint((grid.azimuths_rad + np.pi) / (2 * np.pi) * grid.around).astype(int)
     errors = [np.abs(panorama[:, (columns + k) % grid.around] - view).sum() for k in range(grid.around)]
     best = np.flatnonzero(np.isclose(errors, min(errors)))
@@ -93,7 +93,7 @@ def test_queries_without_a_place_nearby_are_never_drawn(pack_of, grid, tmp_path)
 
 
 def test_a_pack_with_too_few_usable_queries_is_refused_before_training(pack_of, tmp_path, grid):
-    """NumPy's own error said "Cannot take a larger sample than population"."""
+    """Earlier, NumPy raised "Cannot take a larger sample than population"."""
     folder = pack_of(tmp_path / "few", places=20)
     queries = np.load(folder / "queries.npy")
     queries[:5, 0] += 1000.0  # near no place

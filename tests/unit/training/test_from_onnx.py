@@ -27,7 +27,7 @@ def views(shape, pack_folder):
 
 @pytest.fixture
 def exported(shape, views, tmp_path):
-    """An encoder whose normalisation says something: statistics of views, factors and offsets by chance."""
+    """Return an encoder with non-trivial normalisation: random statistics, factors and offsets."""
     torch.manual_seed(1)
     net = EncoderNet(shape).train()
     for module in net.modules():
@@ -46,7 +46,7 @@ def descriptors_of(encoder, planes, side):
     return np.where(side.numpy()[:, None] > 0, both["query"], both["survey"])
 
 
-def test_the_network_says_what_the_encoder_says_in_evaluation_and_in_training(shape, exported, views):
+def test_the_network_equals_the_encoder_in_evaluation_and_in_training(shape, exported, views):
     net = net_of(exported, shape, *views[0])
     planes, side = views[0]
     expected = descriptors_of(Encoder.open(exported), planes, side)
@@ -82,7 +82,7 @@ def test_a_run_may_start_from_an_exported_encoder(shape, exported, pack_folder, 
     assert read_packs(tmp_path / "run") == ["encoder-city-1000", pack_folder.name]
 
 
-def test_a_finished_run_is_not_begun_anew_by_the_same_call(shape, exported, pack_folder, tmp_path):
+def test_a_finished_run_does_not_start_again(shape, exported, pack_folder, tmp_path):
     config = TrainingConfig(steps=2, pairs=24, learning_rate=1e-2, encoder=shape)
     steps = []
     for _ in range(2):
@@ -105,9 +105,7 @@ def test_an_encoder_of_another_shape_is_refused(exported, shape, views):
 
 
 @pytest.mark.parametrize("kind", ["nothing", "empty folder", "broken file", "another shape", "run of another shape"])
-def test_what_no_training_can_start_from_is_refused_before_anything_is_written(
-    kind, exported, shape, pack_folder, tmp_path
-):
+def test_an_unusable_start_model_is_refused_before_anything_is_written(kind, exported, shape, pack_folder, tmp_path):
     other = EncoderShape.model_validate(shape.model_dump() | {"narrow": shape.narrow + 1})
     start, wanted = tmp_path / "start", shape
     if kind == "empty folder":

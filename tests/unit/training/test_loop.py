@@ -30,9 +30,16 @@ GENTLE = Augmentation(
 @pytest.fixture
 def config(shape):
     return TrainingConfig(
-        steps=15, pairs=24, learning_rate=1e-2, warm_up_steps=2, encoder=shape, augmentation=GENTLE, memory_after=4,
-        alike_seeds=3, alike_each=3,
-    )  # fmt: skip
+        steps=15,
+        pairs=24,
+        learning_rate=1e-2,
+        warm_up_steps=2,
+        encoder=shape,
+        augmentation=GENTLE,
+        memory_after=4,
+        alike_seeds=3,
+        alike_each=3,
+    )
 
 
 def run_of(pack_folder, run, config, **options):
@@ -125,7 +132,7 @@ def test_half_precision_learns_as_well_and_leaves_float32_weights(pack_folder, t
     assert {parameter.dtype for parameter in net.parameters()} == {torch.float32}
 
 
-def test_without_a_memory_no_earlier_descriptor_is_asked_for(pack_folder, tmp_path, config, monkeypatch):
+def test_without_a_memory_no_earlier_descriptor_is_used(pack_folder, tmp_path, config, monkeypatch):
     asked = []
     recent = DescriptorMemory.recent
     monkeypatch.setattr(DescriptorMemory, "recent", lambda *given: asked.append(given) or recent(*given))
@@ -135,8 +142,8 @@ def test_without_a_memory_no_earlier_descriptor_is_asked_for(pack_folder, tmp_pa
     assert len(asked) == config.steps - config.memory_after
 
 
-def test_look_alikes_may_be_chosen_without_being_stale_negatives(pack_folder, tmp_path, config, monkeypatch):
-    """The same batches, fewer negatives: lower losses once the memory is asked."""
+def test_hard_negatives_may_be_chosen_without_stale_negatives(pack_folder, tmp_path, config, monkeypatch):
+    """The batches are equal, but there are fewer negatives. So losses are lower once the memory is used."""
     found = {}
     for stale in (True, False):
         losses = found[stale] = []

@@ -15,13 +15,14 @@ def pairs(count=7, seed=0, spread_m=100.0):
 
 
 def slow_loss(queries, surveys, positions_q, positions_s, *, scale, more=(), same_place_m=6.0):
-    """Pair by pair: minus the log of the own one's share, both ways, those too near left out."""
+    """Compute pair by pair: minus the log of the share of the own pair, both directions, without pairs that are too near."""
     losses = []
     for k in range(len(queries)):
         both = 0.0
         for own, asked_at, answers, places in (
-            (queries, positions_q, surveys, positions_s), (surveys, positions_s, queries, positions_q),
-        ):  # fmt: skip
+            (queries, positions_q, surveys, positions_s),
+            (surveys, positions_s, queries, positions_q),
+        ):
             terms = [np.exp(scale * own[k] @ answers[k])]
             others = [(d, at) for j, (d, at) in enumerate(zip(answers, places, strict=True)) if j != k]
             if more:
@@ -60,14 +61,14 @@ def test_earlier_descriptors_are_negatives_unless_they_are_near():
     assert (found > loss_of(*given)[0]).all()
 
 
-def test_an_earlier_look_alike_comes_first_before_the_own_one():
+def test_an_earlier_hard_negative_ranks_before_the_own_view():
     far = np.array([[0.0, 0.0], [50.0, 0.0]])
     q, s = np.eye(2), np.array([[0.8, 0.6], [0.6, 0.8]])
     alike = (np.array([[1.0, 0.0]]), np.array([[200.0, 0.0]]))
     assert loss_of(q, s, far, far, more=(alike, alike))[1].tolist() == [False, True]
 
 
-def test_places_too_near_to_be_told_apart_do_not_repel():
+def test_places_too_near_to_be_distinct_are_no_negatives():
     q, s, pq, ps = pairs(count=2)
     pq[:], ps[:] = [[0, 0], [3, 0]], [[0, 0], [3, 0]]
     np.testing.assert_allclose(loss_of(q, s, pq, ps)[0], 0.0, atol=1e-9)

@@ -8,7 +8,7 @@ from model_training.training.memory import DescriptorMemory  # noqa: E402  # aft
 
 @pytest.fixture
 def memory():
-    """Six pairs, 50 m apart, whose survey view k is most like query k, then k + 1, then the others."""
+    """Return six pairs, 50 m apart. Survey view k is most similar to query k, then to k + 1, then to the others."""
     held = DescriptorMemory(8, 6, torch.device("cpu"))
     xy = torch.arange(6.0)[:, None] * torch.tensor([50.0, 0.0])
     queries = torch.nn.functional.normalize(torch.eye(6) + 0.5 * torch.roll(torch.eye(6), 1, dims=1), dim=1)
@@ -16,7 +16,7 @@ def memory():
     return held
 
 
-def test_what_was_never_drawn_is_never_recent(memory):
+def test_a_never_sampled_view_is_never_recent(memory):
     assert memory.recent(10, 10**6).tolist() == [0, 1, 2, 3, 4, 5]
 
 
@@ -25,11 +25,11 @@ def test_old_descriptors_are_left_out(memory):
     assert memory.recent(35, 10).tolist() == [2]
 
 
-def test_the_look_alike_of_another_place_is_found(memory):
+def test_the_perceptual_alias_of_another_place_is_found(memory):
     assert memory.alike(np.array([1]), np.arange(6), each=1).tolist() == [1, 2]
 
 
-def test_views_of_the_same_place_are_no_look_alikes(memory):
+def test_views_of_the_same_place_are_no_hard_negatives(memory):
     memory.surveys_xy[2] = memory.queries_xy[1] + 2.0
     assert 2 not in memory.alike(np.array([1]), np.array([0, 1, 2, 4]), each=2)
 

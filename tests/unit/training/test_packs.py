@@ -86,7 +86,7 @@ def test_a_pack_that_fails_half_way_is_not_there(grid, tmp_path, monkeypatch):
     assert not (tmp_path / "half").exists()
 
 
-def test_what_a_stopped_run_left_does_not_hinder(pack, grid, tmp_path):
+def test_remains_of_a_stopped_run_do_no_harm(pack, grid, tmp_path):
     (tmp_path / "new.part").mkdir()
     (tmp_path / "new.part" / "places.npy").write_bytes(b"half")
     make_pack(PLAN, tmp_path / "new", grid)
@@ -116,7 +116,7 @@ def test_seeds_of_training_watching_calibration_and_evaluation_are_disjoint(one,
     assert not set(one) & set(other)
 
 
-def test_the_stock_encoder_meets_no_city_that_a_bar_is_measured_on():
+def test_the_stock_encoder_is_not_trained_on_evaluation_cities():
     plans = stock_plans(200)
     assert {plan.name for plan in plans} == {"city"}
     assert {plan.seed for plan in plans} <= set(TRAINING_SEEDS)
@@ -136,9 +136,10 @@ def test_cities_of_matched_pairs_are_none_of_the_stock_recipes():
 
 
 RIG = MatchedRig(
-    CameraPlan(width=160, height=96, horizontal_deg=70.0).pinhole(), (1.4, 1.6),
+    CameraPlan(width=160, height=96, horizontal_deg=70.0).pinhole(),
+    (1.4, 1.6),
     replace(STEREOS["sgbm"], focal_baseline_px_m=60.0, offset_px=0.1, vertical_px=0.05, roll_px=0.05),
-)  # fmt: skip
+)
 MATCHED = PackPlan(seed=1001, places=8, queries_a_place=1, size_m=(120.0, 120.0), rigs=(RIG,))
 
 
@@ -180,7 +181,7 @@ def test_other_rigs_give_other_packs():
 
 
 def test_matched_depth_errs_as_matching_does(matched):
-    """The pose is written down, so the true depth can be rendered: matching is near it, and not equal."""
+    """The pose is stored, so the true depth can be rendered. Matched depth is close to it but not equal."""
     city = City(seed=MATCHED.seed, name=MATCHED.name, size_m=MATCHED.size_m)
     scene = Scene(joined([city.static, city.occupants(OWN_DRIVES)]))
     rays = ViewGrid().rays_level().reshape(-1, 3)

@@ -6,7 +6,7 @@ from model_training.training.precision import forward_in, native_precision  # no
 
 
 @pytest.mark.parametrize(("precision", "dtype"), [("float32", torch.float32), ("bfloat16", torch.bfloat16)])
-def test_products_are_of_the_precision_asked_for(precision, dtype):
+def test_products_have_the_requested_precision(precision, dtype):
     with forward_in(precision):
         assert (torch.ones(2, 2) @ torch.ones(2, 2)).dtype == dtype
     assert (torch.ones(2, 2) @ torch.ones(2, 2)).dtype == torch.float32

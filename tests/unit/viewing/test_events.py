@@ -1,4 +1,4 @@
-"""What datasets, maps and answers are shown as."""
+"""The visual form of datasets, maps and answers."""
 
 import json
 import shutil
@@ -59,7 +59,7 @@ def test_answers_show_each_querys_truth_hypotheses_registration_and_answer(saved
     assert [event for event in events if event.topic == "map/cloud"]
 
 
-def test_answers_are_shown_without_map_and_pictures_that_are_gone(saved_run, tmp_path):
+def test_answers_are_shown_without_missing_maps_and_images(saved_run, tmp_path):
     own = shutil.copytree(saved_run, tmp_path / "own")
     settings = json.loads((own / "run.json").read_text())
     settings["map"]["path"] = settings["dataset"]["path"] = str(tmp_path / "gone")

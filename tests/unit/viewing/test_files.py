@@ -1,4 +1,4 @@
-"""The files, read back by readers of their own."""
+"""The written files, read by independent readers."""
 
 import numpy as np
 import pytest
@@ -15,7 +15,7 @@ SEEN = {"most_scans": 4, "most_points": 500}
 
 @pytest.fixture(scope="module")
 def messages(saved_run, tmp_path_factory):
-    """Topic -> (schema, time in ns, decoded message) of the answers as MCAP."""
+    """Return topic -> (schema, time in ns, decoded message) of the answers in MCAP."""
     pytest.importorskip("foxglove")
     reader_of = pytest.importorskip("mcap.reader")
     decoder = pytest.importorskip("mcap_protobuf.decoder")
@@ -34,12 +34,22 @@ def messages(saved_run, tmp_path_factory):
 
 def test_topics_have_foxgloves_schemas(messages):
     assert {topic: every[0][0].removeprefix("foxglove.") for topic, every in messages.items()} == {
-        "/map/cloud": "PointCloud", "/map/places": "SceneUpdate", "/map/streets": "SceneUpdate", "/tf": "FrameTransforms",
-        "/query/truth": "PosesInFrame", "/query/camera/calibration": "CameraCalibration", "/query/camera/colour": "CompressedImage",
-        "/query/camera/depth": "RawImage", "/query/camera/fused": "CompressedImage", "/answer/neighbours": "PosesInFrame",
-        "/answer/hypotheses": "PosesInFrame", "/answer/registered": "PosesInFrame", "/answer/pose": "PosesInFrame",
-        "/answer/error": "SceneUpdate", "/answer/log": "Log",
-    }  # fmt: skip
+        "/map/cloud": "PointCloud",
+        "/map/places": "SceneUpdate",
+        "/map/streets": "SceneUpdate",
+        "/tf": "FrameTransforms",
+        "/query/truth": "PosesInFrame",
+        "/query/camera/calibration": "CameraCalibration",
+        "/query/camera/colour": "CompressedImage",
+        "/query/camera/depth": "RawImage",
+        "/query/camera/fused": "CompressedImage",
+        "/answer/neighbours": "PosesInFrame",
+        "/answer/hypotheses": "PosesInFrame",
+        "/answer/registered": "PosesInFrame",
+        "/answer/pose": "PosesInFrame",
+        "/answer/error": "SceneUpdate",
+        "/answer/log": "Log",
+    }
 
 
 def test_every_query_is_there_a_second_after_the_one_before(messages):

@@ -27,11 +27,13 @@ def generate_launch_description() -> LaunchDescription:
         DeclareLaunchArgument("log_level", default_value="info", description="debug, info, warn, error or fatal."),
         *(
             DeclareLaunchArgument(
-                name, default_value="", description=f"Overrides {name} of params_file. The package's file says {value!r}."
+                name,
+                default_value="",
+                description=f"Overrides {name} of params_file. The package's file says {value!r}.",
             )
             for name, value in defaults.items()
         ),
-    ]  # fmt: skip
+    ]
     return LaunchDescription([*arguments, OpaqueFunction(function=start, args=[defaults])])
 
 
@@ -46,12 +48,15 @@ def start(context: LaunchContext, defaults: dict[str, Any]) -> list[Node]:
     overrides = {name: value_of(name, text, defaults[name]) for name, text in given.items() if text}
     return [
         Node(
-            package=PACKAGE, executable="bridge", name="streetfix_bridge", output="screen",
+            package=PACKAGE,
+            executable="bridge",
+            name="streetfix_bridge",
+            output="screen",
             namespace=LaunchConfiguration("namespace"),
             parameters=[LaunchConfiguration("params_file"), *([overrides] if overrides else [])],
             arguments=["--ros-args", "--log-level", LaunchConfiguration("log_level")],
         )
-    ]  # fmt: skip
+    ]
 
 
 def value_of(name: str, text: str, default: Any) -> Any:

@@ -42,9 +42,13 @@ def main(args: list[str] | None = None) -> int:
                     f"listening to {settings.color_topic} and {settings.depth_topic}, publishing {settings.pose_topic}"
                 )
                 spin(
-                    node, bridge, over, lambda published: log.info(line_of(published)),
-                    reliable=settings.reliable, depth=settings.queue,
-                )  # fmt: skip
+                    node,
+                    bridge,
+                    over,
+                    lambda published: log.info(line_of(published)),
+                    reliable=settings.reliable,
+                    depth=settings.queue,
+                )
         except StreetfixError as error:
             log.fatal(error.message)
             return 1

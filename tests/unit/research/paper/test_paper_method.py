@@ -22,7 +22,7 @@ GRID = ViewGrid()
 
 
 def frames_of(count: int, seed: int = 0) -> Frames:
-    """Frames whose pictures tell their class at a glance: a bright square at a place of its own."""
+    """Return frames whose images encode their class: a bright square at a class-specific position."""
     rng = np.random.default_rng(seed)
     street = np.arange(count) % 4
     aligned = rng.integers(0, 30, (count, 224, 224)).astype(np.uint8)
@@ -45,10 +45,15 @@ def pairs_of(count: int) -> Pairs:
     T = np.tile(np.eye(4), (count, 1, 1))
     T[:, 0, 3] = 50.0 * street
     return Pairs(
-        np.full((count, 224, 224, 3), 90, np.uint8), np.full((count, 224, 224), 9000, np.uint16), ranges,
-        np.full((count, GRID.rows, GRID.columns, 3), 90, np.uint8), np.zeros((count, 4)), T, street,
+        np.full((count, 224, 224, 3), 90, np.uint8),
+        np.full((count, 224, 224), 9000, np.uint16),
+        ranges,
+        np.full((count, GRID.rows, GRID.columns, 3), 90, np.uint8),
+        np.zeros((count, 4)),
+        T,
+        street,
         PinholeCamera(224, 224, 112.0, 149.3, 111.5, 111.5),
-    )  # fmt: skip
+    )
 
 
 def test_twelve_layers_are_five_convolutions_five_poolings_and_two_full_connections() -> None:
@@ -146,7 +151,7 @@ def test_depth_alone_is_grey_and_fusion_keeps_the_colour() -> None:
     assert fused[..., 0].mean() > fused[..., 1].mean() + 20
 
 
-def test_what_was_not_measured_is_black_in_both_kinds() -> None:
+def test_unmeasured_cells_are_black_in_both_kinds() -> None:
     frames = frames_of(1)
     frames.panoramas[:] = 0
 
@@ -156,7 +161,7 @@ def test_what_was_not_measured_is_black_in_both_kinds() -> None:
     ).any()
 
 
-def test_the_cnn_learns_what_tells_the_classes_apart_and_stops(tmp_path: Path) -> None:
+def test_the_cnn_learns_to_separate_the_classes_and_stops(tmp_path: Path) -> None:
     frames = frames_of(160)
     trainer = CnnTrainer(CnnPlan("aligned", batch=16), frames, None, tmp_path, budget_s=60.0, patience=12)
 
@@ -202,11 +207,17 @@ def test_every_variant_answers_every_set(tmp_path: Path) -> None:
 
     found = run_variant("one_space_both", frames, pairs, tests, frames_of(7, seed=5), tmp_path, budget_s=8.0)
 
-    assert set(found.asked) == {
-        "lidar.same_drive", "lidar.other_drive", "aside", "same_drive", "other_drive", "depth.same_drive", "depth.other_drive",
-    }  # fmt: skip
-    assert len(found.asked["other_drive"].softmax.street) == 5
-    assert set(found.asked["aside"].knn) == set(range(1, 22, 2))
+    assert set(found.answers_by_set) == {
+        "lidar.same_drive",
+        "lidar.other_drive",
+        "aside",
+        "same_drive",
+        "other_drive",
+        "depth.same_drive",
+        "depth.other_drive",
+    }
+    assert len(found.answers_by_set["other_drive"].softmax.street) == 5
+    assert set(found.answers_by_set["aside"].knn) == set(range(1, 22, 2))
     assert found.processor_s > 0
     assert found.images > 0
 
@@ -215,7 +226,7 @@ def test_plans_differ_in_what_they_say() -> None:
     assert len(set(PLANS.values())) == len(PLANS)
 
 
-def test_learnt_frames_are_drawn_without_their_neighbours_watched(tmp_path: Path) -> None:
+def test_training_frames_exclude_neighbours_of_validation_frames(tmp_path: Path) -> None:
     trainer = CnnTrainer(
         CnnPlan("view", pairs_too=True, batch=12), frames_of(100), pairs_of(40), tmp_path, budget_s=1.0
     )

@@ -9,7 +9,7 @@ from service.geometry.rigid import rotation_z
 
 
 def street_scan() -> NDArray[np.float64]:
-    """Two walls along x, 10 m apart, the left one longer ahead; ground below."""
+    """Return two walls along x, 10 m apart, and ground. The left wall is longer ahead."""
     rng = np.random.default_rng(3)
     left = np.c_[rng.uniform(-20, 40, 3000), np.full(3000, 5.0), rng.uniform(-1.8, 4, 3000)]
     right = np.c_[rng.uniform(-20, 25, 2000), np.full(2000, -5.0), rng.uniform(-1.8, 4, 2000)]

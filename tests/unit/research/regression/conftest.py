@@ -1,4 +1,4 @@
-"""A hall of walls, ground and roof, and pairs taken in it."""
+"""A hall with walls, ground and roof, and image pairs taken in it."""
 
 from collections.abc import Callable
 
@@ -17,7 +17,7 @@ PILLAR_RADIUS_M = 1.5
 
 
 def depth_in_hall(T_map_camera):
-    """Z (224, 224) of walls, ground, roof and pillars."""
+    """Return Z (224, 224) of walls, ground, roof and pillars."""
     rays_camera = CAMERA.rays_of_pixels().reshape(-1, 3)
     rays, origin = rays_camera @ T_map_camera[:3, :3].T, T_map_camera[:3, 3]
     with np.errstate(divide="ignore"):
@@ -36,7 +36,7 @@ def camera_at(x, y, heading_rad):
 
 @pytest.fixture(scope="session", autouse=True)
 def one_thread():
-    """Two threads that wait for each other on a busy machine take many times as long."""
+    """Two threads that wait for each other are many times slower on a busy machine."""
     from research.baselines.learning import one_thread
 
     with one_thread():
@@ -45,7 +45,7 @@ def one_thread():
 
 @pytest.fixture(scope="session")
 def pairs_in_hall() -> Callable[..., Pairs]:
-    """Pairs spread over the hall; colours tell the place."""
+    """Return pairs spread over the hall. Colours encode the position."""
 
     def made(count: int = 12, *, seed: int = 0) -> Pairs:
         rng = np.random.default_rng(seed)
@@ -65,7 +65,7 @@ def pairs_in_hall() -> Callable[..., Pairs]:
 
 @pytest.fixture(scope="session")
 def hall(pairs_in_hall) -> MapCloud:
-    """The hall's surfaces as points a foot apart."""
+    """Return the surfaces of the hall as points 0.3 m apart."""
     T = [camera_at(x, y, heading) for x in range(6, 60, 12) for y in (8.0, 16.0) for heading in np.arange(0, 6, 1.5)]
     seen = []
     for each in T:

@@ -19,7 +19,7 @@ def test_an_inception_block_puts_its_branches_side_by_side():
 
 
 def test_the_network_is_as_wide_as_published(net):
-    """Table 1 of the paper: 1,024 features before the last layer, and about 6 million weights but for the heads."""
+    """Table 1 of the paper: 1,024 features before the last layer, and about 6 million weights without the heads."""
     heads = ("head.", "auxiliary.")
     weights = sum(p.numel() for name, p in net.named_parameters() if not name.startswith(heads) and p.dim() == 4)
     biases = 64 * 7 * 7  # the fourth plane's

@@ -10,7 +10,7 @@ from research.baselines.regression.lucas_kanade import (
     jacobian,
     moved,
     transform_of,
-)  # fmt: skip
+)
 from research.baselines.regression.pointnet import PointNet
 
 
@@ -21,7 +21,7 @@ def net():
 
 
 def clouds(count, points=240):
-    """Walls at right angles and a ground, of a size near 1."""
+    """Return walls at right angles and a ground, of a size near 1."""
     rng = np.random.default_rng(5)
     found = rng.uniform(-1, 1, (count, points, 3))
     found[:, : points // 3, 0] = 0.9
@@ -59,7 +59,7 @@ def test_the_jacobian_foretells_the_features_of_a_template_moved_back(net):
 
 @pytest.mark.parametrize("size", [0.02, 0.05, 0.1])
 def test_a_known_perturbation_is_found_again(net, size):
-    """Untrained features are enough where both clouds are the same points."""
+    """Untrained features suffice if both clouds have the same points."""
     template = clouds(5)
     twists = torch.from_numpy(np.random.default_rng(1).normal(size=(5, 6))) * size
     T_true = transform_of(twists)

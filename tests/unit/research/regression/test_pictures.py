@@ -13,7 +13,7 @@ from research.baselines.regression.pictures import (
     poses_of,
     transforms_of,
     watched_rows,
-)  # fmt: skip
+)
 from service.errors import DatasetError
 
 

@@ -38,7 +38,7 @@ def test_depth_becomes_points_on_the_map_s_surfaces(query, hall):
     assert np.median(apart) < 0.3
 
 
-def test_a_camera_is_shown_what_lies_before_it(query, hall):
+def test_a_camera_shows_what_is_in_front_of_it(query, hall):
     _, T_map_camera, camera = query
     seen = map_points_in_view(hall, T_map_camera, camera)
     assert len(seen) > 200
@@ -46,7 +46,7 @@ def test_a_camera_is_shown_what_lies_before_it(query, hall):
     assert (np.linalg.norm(seen, axis=1) < 30.0).all()
 
 
-def test_what_stands_behind_a_wall_is_not_shown(query, hall):
+def test_surfaces_behind_a_wall_are_not_shown(query, hall):
     _, T_map_camera, camera = query
     behind = transform_points(T_map_camera, np.random.default_rng(0).uniform([-2, -1, 20], [2, 1, 25], (300, 3)))
     wall = transform_points(T_map_camera, np.random.default_rng(1).uniform([-3, -3, 10], [3, 3, 10.1], (5000, 3)))
@@ -83,15 +83,15 @@ def test_icp_keeps_the_pose_where_it_cannot_register(query, hall, case):
 
 
 def test_icp_keeps_the_pose_where_too_few_points_fit(query, hall):
-    """Points strewn about meet some wall or other."""
+    """Random points are near some wall."""
     _, T_map_camera, _ = query
     strewn = np.random.default_rng(0).uniform([-10, -5, 1], [10, 1, 20], (800, 3))
     found = by_icp(hall, strewn, T_map_camera)
     assert not found.registered
 
 
-def test_pointnet_lk_brings_the_points_onto_what_the_map_shows(query, net, monkeypatch):
-    """Untrained features are enough where the map shows the very points."""
+def test_pointnet_lk_aligns_the_points_with_the_map(query, net, monkeypatch):
+    """Untrained features suffice if the map shows exactly these points."""
     points, T_map_camera, camera = query
     points = points[:: len(points) // refine.LK_POINTS][: refine.LK_POINTS]
     wrong = off_by(T_map_camera, 0.4, 0.0, 0.4, 0.0, 0.03, 0.0)
@@ -103,7 +103,7 @@ def test_pointnet_lk_brings_the_points_onto_what_the_map_shows(query, net, monke
 
 
 def test_pointnet_lk_keeps_the_pose_where_its_own_fits_the_map_worse(query, hall, net, monkeypatch):
-    """What the map shows is said to lie 3 m ahead of where it lies."""
+    """The given map points are 3 m ahead of their true position."""
     points, T_map_camera, camera = query
     points = points[:: len(points) // refine.LK_POINTS][: refine.LK_POINTS]
     monkeypatch.setattr(refine, "map_points_in_view", lambda *_: points + [0.0, 0.0, 3.0])

@@ -33,8 +33,16 @@ def asked(small_dataset, tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
         for train in (train_pose, train_lk):
             patch.setattr(module, train.__name__, noted(train))
-        result = module.run(pairs, small_dataset.folder, {"small": pairs}, folder / "work", budget_s=4.0,
-                            report=lambda *each: calls.append(each), pose=POSE, lk=LK)  # fmt: skip
+        result = module.run(
+            pairs,
+            small_dataset.folder,
+            {"small": pairs},
+            folder / "work",
+            budget_s=4.0,
+            report=lambda *each: calls.append(each),
+            pose=POSE,
+            lk=LK,
+        )
     return pairs, result, calls, budgets
 
 

@@ -41,7 +41,7 @@ def test_the_best_network_is_read_back(run_in_two_parts):
         assert net(torch.zeros(1, 5, 3)).shape == (1, 512)
 
 
-def test_wrong_poses_are_off_as_far_as_asked():
+def test_wrong_poses_have_the_requested_error():
     T = np.tile(np.eye(4), (4000, 1, 1))
     off = wrong_poses(T, replace(SMALL, level_m=2.0, yaw_rad=0.0, tilt_rad=0.0), np.random.default_rng(0))
     np.testing.assert_allclose(off[:, :3, 3].std(axis=0), [2.0, 0.3, 2.0], rtol=0.05)

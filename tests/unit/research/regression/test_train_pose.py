@@ -32,7 +32,7 @@ def test_a_few_pairs_are_learnt_by_heart(pairs_in_hall):
 
 @pytest.fixture(scope="module")
 def run_in_two_parts(pairs_in_hall, tmp_path_factory):
-    """The pairs, and a folder trained for a second and then, from its checkpoint, for another."""
+    """Return the pairs, and a folder with a training of one second that continued from its checkpoint for another second."""
     folder, pairs = tmp_path_factory.mktemp("runs") / "googlenet", pairs_in_hall()
     first = train_pose(pairs, folder, SMALL, budget_s=1.0)
     second = train_pose(pairs, folder, SMALL, budget_s=first.curve[-1].processor_s + 1.0)
@@ -71,8 +71,8 @@ def test_the_best_network_answers_in_the_map(run_in_two_parts):
     assert np.abs(T_map_camera[:, :3, 3] - [30.0, 11.0, 1.6]).max() < 60.0
 
 
-def test_what_was_saved_is_what_goes_on(pairs_in_hall):
-    """A step after a restart is the step that would have come without it."""
+def test_a_restarted_training_continues_exactly(pairs_in_hall):
+    """A step after a restart equals the step of an uninterrupted run."""
     pairs = pairs_in_hall()
     shown, frame = np.arange(len(pairs)), MapFrame.of(pairs.T_map_camera[:, :3, 3])
     straight = module.PoseLearner(pairs, frame, SMALL)

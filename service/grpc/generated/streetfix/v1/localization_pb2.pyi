@@ -325,7 +325,7 @@ class Options(_message.Message):
     def __init__(self, neighbours: _Optional[int] = ..., refine: _Optional[bool] = ..., false_accept_rate: _Optional[float] = ...) -> None: ...
 
 class LocalizeResponse(_message.Message):
-    __slots__ = ("status", "confidence", "street", "pose", "vehicle_pose", "geopose", "neighbours", "map", "timings", "hypotheses", "spread", "reasons", "camera_height", "calibration", "extrapolated")
+    __slots__ = ("status", "confidence", "street", "pose", "vehicle_pose", "geopose", "neighbours", "map", "timings", "hypotheses", "spread", "reasons", "camera_height", "calibration", "extrapolated", "threshold")
     class ExtrapolatedEntry(_message.Message):
         __slots__ = ("key", "value")
         KEY_FIELD_NUMBER: _ClassVar[int]
@@ -348,6 +348,7 @@ class LocalizeResponse(_message.Message):
     CAMERA_HEIGHT_FIELD_NUMBER: _ClassVar[int]
     CALIBRATION_FIELD_NUMBER: _ClassVar[int]
     EXTRAPOLATED_FIELD_NUMBER: _ClassVar[int]
+    THRESHOLD_FIELD_NUMBER: _ClassVar[int]
     status: LocalizationStatus
     confidence: float
     street: Street
@@ -363,7 +364,16 @@ class LocalizeResponse(_message.Message):
     camera_height: CameraHeight
     calibration: CalibrationRange
     extrapolated: _containers.ScalarMap[str, float]
-    def __init__(self, status: _Optional[_Union[LocalizationStatus, str]] = ..., confidence: _Optional[float] = ..., street: _Optional[_Union[Street, _Mapping]] = ..., pose: _Optional[_Union[Pose, _Mapping]] = ..., vehicle_pose: _Optional[_Union[Pose, _Mapping]] = ..., geopose: _Optional[_Union[GeoPose, _Mapping]] = ..., neighbours: _Optional[_Iterable[_Union[Neighbour, _Mapping]]] = ..., map: _Optional[_Union[MapVersion, _Mapping]] = ..., timings: _Optional[_Union[Timings, _Mapping]] = ..., hypotheses: _Optional[_Iterable[_Union[Hypothesis, _Mapping]]] = ..., spread: _Optional[_Union[Spread, _Mapping]] = ..., reasons: _Optional[_Iterable[_Union[Reason, _Mapping]]] = ..., camera_height: _Optional[_Union[CameraHeight, _Mapping]] = ..., calibration: _Optional[_Union[CalibrationRange, str]] = ..., extrapolated: _Optional[_Mapping[str, float]] = ...) -> None: ...
+    threshold: AcceptanceThreshold
+    def __init__(self, status: _Optional[_Union[LocalizationStatus, str]] = ..., confidence: _Optional[float] = ..., street: _Optional[_Union[Street, _Mapping]] = ..., pose: _Optional[_Union[Pose, _Mapping]] = ..., vehicle_pose: _Optional[_Union[Pose, _Mapping]] = ..., geopose: _Optional[_Union[GeoPose, _Mapping]] = ..., neighbours: _Optional[_Iterable[_Union[Neighbour, _Mapping]]] = ..., map: _Optional[_Union[MapVersion, _Mapping]] = ..., timings: _Optional[_Union[Timings, _Mapping]] = ..., hypotheses: _Optional[_Iterable[_Union[Hypothesis, _Mapping]]] = ..., spread: _Optional[_Union[Spread, _Mapping]] = ..., reasons: _Optional[_Iterable[_Union[Reason, _Mapping]]] = ..., camera_height: _Optional[_Union[CameraHeight, _Mapping]] = ..., calibration: _Optional[_Union[CalibrationRange, str]] = ..., extrapolated: _Optional[_Mapping[str, float]] = ..., threshold: _Optional[_Union[AcceptanceThreshold, _Mapping]] = ...) -> None: ...
+
+class AcceptanceThreshold(_message.Message):
+    __slots__ = ("confidence", "false_accept_rate")
+    CONFIDENCE_FIELD_NUMBER: _ClassVar[int]
+    FALSE_ACCEPT_RATE_FIELD_NUMBER: _ClassVar[int]
+    confidence: float
+    false_accept_rate: float
+    def __init__(self, confidence: _Optional[float] = ..., false_accept_rate: _Optional[float] = ...) -> None: ...
 
 class CameraHeight(_message.Message):
     __slots__ = ("height_m", "origin")

@@ -105,7 +105,7 @@ class Frame:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Asked(Generic[D]):
+class PreparedRequest(Generic[D]):
     """A request with its encoded images.
 
     Attributes:
@@ -117,7 +117,9 @@ class Asked(Generic[D]):
     pictures: tuple[tuple[bytes, bytes], ...]
 
 
-def one(rgb: Rgb, depth: Depth, camera: Camera, about: About, packing: Packing) -> Asked[schema.LocalizeRequest]:
+def one(
+    rgb: Rgb, depth: Depth, camera: Camera, about: About, packing: Packing
+) -> PreparedRequest[schema.LocalizeRequest]:
     """Build the request for a single query.
 
     Args:
@@ -133,15 +135,21 @@ def one(rgb: Rgb, depth: Depth, camera: Camera, about: About, packing: Packing) 
     """
     _only_known(about, About)
     names = (
-        "gravity", "depth_scale_m", "depth_kind", "max_range_m", "baseline_m", "camera_height_m", "camera_height_std_m",
-    )  # fmt: skip
+        "gravity",
+        "depth_scale_m",
+        "depth_kind",
+        "max_range_m",
+        "baseline_m",
+        "camera_height_m",
+        "camera_height_std_m",
+    )
     known = {name: about[name] for name in names if name in about}  # type: ignore[literal-required]  # names of About
     frame = Frame(rgb=rgb, depth=depth, camera=camera, **known)
     said, pictures = _frame(frame, packing)
-    return Asked(_checked(lambda: schema.LocalizeRequest.model_validate(said | _of_all(about))), (pictures,))
+    return PreparedRequest(_checked(lambda: schema.LocalizeRequest.model_validate(said | _of_all(about))), (pictures,))
 
 
-def several(frames: Sequence[Frame], about: AboutSequence, packing: Packing) -> Asked[schema.BatchRequest]:
+def several(frames: Sequence[Frame], about: AboutSequence, packing: Packing) -> PreparedRequest[schema.BatchRequest]:
     """Build the request for a batch of independent queries.
 
     Args:
@@ -163,10 +171,12 @@ def several(frames: Sequence[Frame], about: AboutSequence, packing: Packing) -> 
     said = [_frame(frame, packing, f"frames.{number}.") for number, frame in enumerate(frames)]
     requests = [each | _of_all(about) for each, _ in said]
     document = _checked(lambda: schema.BatchRequest.model_validate({"requests": requests}))
-    return Asked(document, tuple(pictures for _, pictures in said))
+    return PreparedRequest(document, tuple(pictures for _, pictures in said))
 
 
-def sequence(frames: Sequence[Frame], about: AboutSequence, packing: Packing) -> Asked[schema.SequenceRequest]:
+def sequence(
+    frames: Sequence[Frame], about: AboutSequence, packing: Packing
+) -> PreparedRequest[schema.SequenceRequest]:
     """Build the request for a sequence, which gets one common answer.
 
     Args:
@@ -185,7 +195,7 @@ def sequence(frames: Sequence[Frame], about: AboutSequence, packing: Packing) ->
         for number, (frame, (each, _)) in enumerate(zip(frames, said, strict=True))
     ]
     document = _checked(lambda: schema.SequenceRequest.model_validate({"frames": content} | _of_all(about)))
-    return Asked(document, tuple(pictures for _, pictures in said))
+    return PreparedRequest(document, tuple(pictures for _, pictures in said))
 
 
 def _frame(frame: Frame, packing: Packing, where: str = "") -> tuple[dict[str, Any], tuple[bytes, bytes]]:
@@ -202,10 +212,13 @@ def _frame(frame: Frame, packing: Packing, where: str = "") -> tuple[dict[str, A
     said = {
         "camera": _camera(frame.camera) | _height(frame, where),
         "depth": {
-            "scale_m": scale_m, "kind": frame.depth_kind, "max_range_m": frame.max_range_m, "baseline_m": frame.baseline_m,
+            "scale_m": scale_m,
+            "kind": frame.depth_kind,
+            "max_range_m": frame.max_range_m,
+            "baseline_m": frame.baseline_m,
         },
         "gravity": _vector(frame.gravity, f"{where}gravity"),
-    }  # fmt: skip
+    }
     return said, (rgb, depth)
 
 
@@ -238,12 +251,15 @@ def _of_all(about: About | AboutSequence) -> dict[str, Any]:
     options, prior = about.get("options"), about.get("prior")
     if prior is not None and prior.position is not None and prior.wgs84 is not None:  # gRPC could send only one of them
         raise RequestError("prior: position and wgs84 exclude each other; send one of them", field="prior")
-    return {
-        "map": about.get("map"), "prior": prior,
-        "T_vehicle_camera": _transform(about.get("T_vehicle_camera"), "T_vehicle_camera"),
-    } | ({} if options is None else {"options": options}) | (
-        {"vehicle_base_on_ground": about["vehicle_base_on_ground"]} if "vehicle_base_on_ground" in about else {}
-    )  # fmt: skip
+    return (
+        {
+            "map": about.get("map"),
+            "prior": prior,
+            "T_vehicle_camera": _transform(about.get("T_vehicle_camera"), "T_vehicle_camera"),
+        }
+        | ({} if options is None else {"options": options})
+        | ({"vehicle_base_on_ground": about["vehicle_base_on_ground"]} if "vehicle_base_on_ground" in about else {})
+    )
 
 
 def _camera(camera: Camera) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""What each patch of a picture pulls a pose by; against numerical derivatives in ``test_jacobian``."""
+"""The gradients of the patches of an image. ``test_jacobian`` compares derivatives with numerical ones."""
 
 from dataclasses import replace
 from typing import Any
@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from service.geometry.rigid import rotation_z
-from service.registration.kernel import SURFEL, SolverOptions, align, nearest_grid, pulls
+from service.registration.kernel import SURFEL, SolverOptions, align, gradients, nearest_grid
 
 #: A fixture of two values: grid and surfels, or rotation and position.
 Pair = tuple[Any, Any]
@@ -19,7 +19,7 @@ OPTIONS = SolverOptions(iterations=1, reach=1.0, robust_first=1e6, robust_last=1
 
 @pytest.fixture(scope="module")
 def wall():
-    """One surfel at the origin that faces x, as the kernel takes a map: its grid and itself."""
+    """Return grid and surfel of a map with one surfel at the origin that faces x."""
     surfels = np.zeros(1, SURFEL)
     surfels["normal"] = [1, 0, 0]
     return nearest_grid(surfels, cell_m=0.3, reach_m=1.2), surfels
@@ -27,7 +27,7 @@ def wall():
 
 @pytest.fixture(scope="module")
 def ground(scene_of):
-    """12 x 12 m about the origin."""
+    """Return a ground of 12 x 12 m about the origin."""
     surfels = scene_of(((-6, -6, 0), (12, 0, 0), (0, 12, 0))).surfels()
     return nearest_grid(surfels, cell_m=0.4, reach_m=1.2), surfels
 
@@ -36,23 +36,23 @@ def numbers(*patch):
     return np.array(patch, np.int32)
 
 
-def test_the_pull_of_a_point_by_hand(wall: Pair, points_at, start_at):
-    """0.1 m behind the wall, known to 0.1 m: a weight of 100, so 10 for each unit of the gradient.
+def test_the_gradient_of_a_point_by_hand(wall: Pair, points_at, start_at):
+    """The point is 0.1 m behind the wall with sigma 0.1 m: weight 100, so 10 per unit of the derivative.
 
-    The gradient: the normal; (5.1, 0.3, -0.2) x (1, 0, 0) = (0, -0.2, -0.3); 5.1 of scale; and of the offset less 5.1 x 5.1 / 80.
+    Derivatives: the normal; (5.1, 0.3, -0.2) x (1, 0, 0) = (0, -0.2, -0.3); 5.1 for the scale; -5.1 x 5.1 / 80 for the offset.
     """
     point = points_at([[5.1, 0.3, -0.2]], sigma=0.0, focal_baseline_px_m=80.0)
-    found = pulls(*wall, point, start_at(np.eye(3), [-5.0, 0, 0]), OPTIONS, numbers(0))
+    found = gradients(*wall, point, start_at(np.eye(3), [-5.0, 0, 0]), OPTIONS, numbers(0))
     expected = [[10, 0, 0, 0, -2, -3, 51, -51 * 5.1 / 80]]
     np.testing.assert_allclose(found, expected, rtol=1e-4, atol=1e-4)
 
 
-def test_pulls_of_opposite_residuals_meet_in_one_patch_and_show_in_two(wall: Pair, points_at, start_at):
-    """0.1 m behind the wall and 0.1 m before it; a patch's own points may cancel, the patches of a picture do not."""
+def test_gradients_of_opposite_residuals_cancel_in_one_patch_but_not_in_two(wall: Pair, points_at, start_at):
+    """The points are 0.1 m behind and 0.1 m in front of the wall. They cancel in one patch, but not in two."""
     points = points_at([[5.1, 0.3, 0], [4.9, 0.3, 0]], sigma=0.0, weight=[1, 3])
     start = start_at(np.eye(3), [-5.0, 0, 0])
-    together = pulls(*wall, points, start, OPTIONS, numbers(0, 0))
-    apart = pulls(*wall, points, start, OPTIONS, numbers(1, 0))
+    together = gradients(*wall, points, start, OPTIONS, numbers(0, 0))
+    apart = gradients(*wall, points, start, OPTIONS, numbers(1, 0))
     np.testing.assert_allclose(together[:, 0], [-20], rtol=1e-4)
     np.testing.assert_allclose(apart[:, 0], [-30, 10], rtol=1e-4)
     np.testing.assert_allclose(apart.sum(axis=0), together[0], rtol=1e-12)
@@ -62,53 +62,53 @@ def test_pulls_of_opposite_residuals_meet_in_one_patch_and_show_in_two(wall: Pai
     ("robust_m", "weight"), [(1e6, 100.0), (0.3, 100 * (0.13 / 0.14) ** 2), (1e-6, 100 * (0.04 / 0.05) ** 2)]
 )
 def test_the_robust_width_is_that_of_the_last_iteration(wall: Pair, points_at, start_at, robust_m, weight):
-    """However wide the first was; 0.1 m off, as in ``test_jacobian``."""
+    """The first width has no effect. The point is 0.1 m off, as in ``test_jacobian``."""
     options = replace(OPTIONS, robust_first=5.0, robust_last=robust_m, iterations=8)
-    found = pulls(*wall, points_at([[5.1, 0, 0]], sigma=0.0), start_at(np.eye(3), [-5.0, 0, 0]), options, numbers(0))
+    found = gradients(
+        *wall, points_at([[5.1, 0, 0]], sigma=0.0), start_at(np.eye(3), [-5.0, 0, 0]), options, numbers(0)
+    )
     assert found[0, 0] == pytest.approx(0.1 * weight, rel=1e-4)
 
 
-def test_points_on_their_surface_pull_nowhere(ground: Pair, points_at, start_at):
-    """Exactly on it, in whatever numbers, and they do inform."""
+def test_points_on_their_surface_have_no_gradient(ground: Pair, points_at, start_at):
+    """For points on their surface in any arrangement, the gradient is 0 and the information is not."""
     xy = np.random.default_rng(1).uniform(-5, 5, (100, 2))
     points, start = points_at(np.c_[xy, np.full(100, -1.5)]), start_at(rotation_z(0.3), [0, 0, 1.5])
-    found = pulls(*ground, points, start, OPTIONS, np.arange(100, dtype=np.int32) % 7)
+    found = gradients(*ground, points, start, OPTIONS, np.arange(100, dtype=np.int32) % 7)
     np.testing.assert_array_equal(found, np.zeros((7, 8)))
     align(*ground, points, start, OPTIONS)
     assert start["information"][0, 2, 2] > 100
 
 
-def test_points_that_meet_no_surface_within_reach_pull_nowhere(ground: Pair, points_at, start_at):
-    """The last three: 0.6 m above the ground where 0.5 m are looked at, beyond the grid, and of no weight."""
+def test_points_without_a_surface_in_reach_have_no_gradient(ground: Pair, points_at, start_at):
+    """The last three points: 0.6 m above the ground with a limit of 0.5 m, beyond the grid, and with weight 0."""
     near, start = [[1.0, 1, -1.4], [2, -2, -1.6]], start_at(np.eye(3), [0, 0, 1.5])
     options = replace(OPTIONS, reach=0.5)
     points = points_at([*near, [1, 0, -0.9], [500, 0, 0], [0, 1, -1.4]], weight=[1, 1, 1, 1, 0])
-    found = pulls(*ground, points, start, options, numbers(0, 1, 2, 2, 2))
+    found = gradients(*ground, points, start, options, numbers(0, 1, 2, 2, 2))
     np.testing.assert_array_equal(found[2], np.zeros(8))
-    np.testing.assert_array_equal(found[:2], pulls(*ground, points_at(near), start, options, numbers(0, 1)))
+    np.testing.assert_array_equal(found[:2], gradients(*ground, points_at(near), start, options, numbers(0, 1)))
     assert found[0, 2] > 0 > found[1, 2]
-    assert pulls(*ground, points, start, replace(OPTIONS, reach=1.0), numbers(0, 1, 2, 2, 2))[2, 2] > 0
+    assert gradients(*ground, points, start, replace(OPTIONS, reach=1.0), numbers(0, 1, 2, 2, 2))[2, 2] > 0
 
 
 def test_no_points_are_no_patches(ground: Pair, points_at, start_at):
     none = points_at(np.zeros((0, 3)))
-    assert pulls(*ground, none, start_at(np.eye(3), [0, 0, 1.5]), OPTIONS, numbers()).shape == (0, 8)
+    assert gradients(*ground, none, start_at(np.eye(3), [0, 0, 1.5]), OPTIONS, numbers()).shape == (0, 8)
 
 
 @given(st.integers(0, 10**6), st.integers(1, 200), st.integers(1, 40))
-def test_however_a_picture_is_cut_into_patches_their_pulls_add_up_to_its_own(
-    street_map, seen, pose, start_at, seed, count, cut
-):
-    """And a patch of a picture pulls as it does alone."""
+def test_the_gradients_of_all_patches_sum_to_that_of_the_image(street_map, seen, pose, start_at, seed, count, cut):
+    """The gradient of a patch does not depend on the other patches."""
     rng = np.random.default_rng(seed)
     points = seen.subset(rng.permutation(len(seen))[:count])
     patch = np.unique(rng.integers(0, cut, count), return_inverse=True)[1].astype(np.int32)
     start = start_at(rotation_z(0.02) @ pose[0], pose[1] + [0.2, -0.1, 0.05], log_scale=0.002, offset=0.05)
     asked = street_map.grid, street_map.surfels
-    found = pulls(*asked, points, start, OPTIONS, patch)
-    whole = pulls(*asked, points, start, OPTIONS, np.zeros(count, np.int32))
+    found = gradients(*asked, points, start, OPTIONS, patch)
+    whole = gradients(*asked, points, start, OPTIONS, np.zeros(count, np.int32))
     assert found.shape == (patch.max() + 1, 8)
     np.testing.assert_allclose(found.sum(axis=0), whole[0], rtol=1e-9, atol=1e-6)
     rows = np.flatnonzero(patch == patch[0])
-    alone = pulls(*asked, points.subset(rows), start, OPTIONS, np.zeros(len(rows), np.int32))
+    alone = gradients(*asked, points.subset(rows), start, OPTIONS, np.zeros(len(rows), np.int32))
     np.testing.assert_allclose(found[patch[0]], alone[0], rtol=1e-9, atol=1e-6)

@@ -1,0 +1,185 @@
+"""The correction of the confidence for a rig, and how it gets into a bundle."""
+
+import errno
+import json
+import os
+import subprocess
+import sys
+import textwrap
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from pydantic import ValidationError
+
+from service.confidence.decision import decide
+from service.confidence.features import FEATURES
+from service.errors import BundleError
+from service.maps import writer
+from service.maps.calibration import RigCorrection, probability, read_calibration
+from service.maps.reader import MapBundle
+from service.maps.writer import replace_calibration, write_bundle
+
+RIG = {
+    "scale": 0.5, "offset": -1.0, "source": "drive", "measured_on": "a drive", "frames": 40, "right": 20, "outside": 15,
+    "error_before": 0.2, "error_after": 0.05, "accepted": 18, "accepted_wrong": 1, "wrong_share_upper": 0.24,
+    "outside_accepted": 0, "outside_share_upper": 0.18,
+}  # fmt: skip
+
+
+def rig(**changed):
+    return RigCorrection.model_validate(RIG | changed)
+
+
+def test_the_formula_by_hand(calibration_of):
+    """Log odds of 4 become 0.5 x 4 - 1 = 1, so the confidence is e / (1 + e) = 0.731."""
+    calibration = calibration_of(right={"terms": [], "bias": 4.0}, rig=RIG)
+    assert float(calibration.confidence(np.zeros(len(FEATURES)))) == pytest.approx(0.7310586)
+    np.testing.assert_allclose(rig().corrected(np.array([0.0, 2.0, -2.0])), [-1, 0, -2])
+
+
+def test_the_correction_of_the_rig_comes_after_that_of_the_site(calibration_of):
+    """0.5 x (4 - 1) - 1 = 0.5."""
+    site = {"offset": -1.0, "queries": 10, "right": 5, "expected_calibration_error": 0.0}
+    calibration = calibration_of(right={"terms": [], "bias": 4.0}, rig=RIG, site=site)
+    assert float(calibration.confidence(np.zeros(len(FEATURES)))) == pytest.approx(float(probability(np.array(0.5))))
+
+
+def test_a_file_without_the_field_has_no_correction(calibration_json):
+    document = calibration_json()
+    del document["rig"]
+    found = read_calibration(json.dumps(document).encode(), path="x")
+    assert found is not None
+    assert found.rig is None
+
+
+@pytest.mark.parametrize(
+    "changed", [{"scale": 0.1}, {"scale": float("nan")}, {"frames": -1}, {"wrong_share_upper": 1.2}, {"source": "guess"}]
+)  # fmt: skip
+def test_a_correction_that_makes_no_sense_is_refused(changed):
+    with pytest.raises(ValidationError):
+        rig(**changed)
+
+
+@given(st.lists(st.floats(-30, 30), min_size=2, max_size=50), st.floats(0.2, 5), st.floats(-10, 10))
+def test_no_correction_inverts_the_order_of_two_answers(odds, scale, offset):
+    given_odds = np.sort(np.array(odds))
+    confidence = probability(rig(scale=scale, offset=offset).corrected(given_odds))
+    assert (np.diff(confidence) >= 0).all()
+
+
+def test_an_answer_raised_above_the_odds_of_being_in_the_map_gains_from_a_prior(calibration_of):
+    """Log odds of 0 become 2. The model ``known`` still says -2, but a right answer is in the map."""
+    flat = {"terms": []}
+    calibration = calibration_of(
+        right=flat | {"bias": 0.0}, known=flat | {"bias": -2.0}, rig=RIG | {"scale": 1, "offset": 2}
+    )
+    evidence = np.zeros(len(FEATURES))
+    without, with_prior = (decide(calibration, evidence, 0.01, prior_nats=nats).confidence for nats in (0.0, 1.0))
+    assert without == pytest.approx(float(probability(np.array(2.0))))
+    assert with_prior == pytest.approx(float(probability(np.array(3.0))))
+    # Without a correction for a rig the decision is as before.
+    plain = calibration_of(right=flat | {"bias": 0.0}, known=flat | {"bias": -2.0})
+    assert decide(plain, evidence, 0.01, prior_nats=1.0).confidence == pytest.approx(float(probability(np.array(-1.0))))
+
+
+def rig_in(bundle):
+    calibration = MapBundle.open(bundle).calibration
+    assert calibration is not None
+    return calibration.rig
+
+
+@pytest.fixture
+def calibrated(content_of, calibration_json, tmp_path):
+    folder = tmp_path / "town"
+    write_bundle(folder, content_of(calibration=calibration_json()))
+    return folder
+
+
+def test_the_calibration_of_a_bundle_is_replaced_and_all_else_stays(calibrated, calibration_json):
+    before = MapBundle.open(calibrated)
+    inode = (calibrated / "places.npy").stat().st_ino
+    made = replace_calibration(calibrated, calibration_json(rig=RIG))
+    after = MapBundle.open(calibrated)
+    assert after.calibration is not None
+    assert after.calibration.rig == rig()
+    assert after.manifest == made
+    assert made.version != before.manifest.version
+    assert made.made_at > before.manifest.made_at
+    unchanged = {name: entry for name, entry in made.files.items() if name != "calibration.json"}
+    assert unchanged == {name: entry for name, entry in before.manifest.files.items() if name != "calibration.json"}
+    assert (calibrated / "places.npy").stat().st_ino == inode
+    assert [path.name for path in calibrated.parent.iterdir()] == ["town"]
+
+
+def test_a_process_with_the_old_bundle_open_keeps_it(calibrated, calibration_json):
+    before = MapBundle.open(calibrated)
+    places = np.array(before.T_map_place)
+    replace_calibration(calibrated, calibration_json(rig=RIG))
+    np.testing.assert_array_equal(before.T_map_place, places)
+
+
+def test_files_are_copied_where_there_are_no_hard_links(calibrated, calibration_json, monkeypatch):
+    def refused(*_):
+        raise OSError(errno.EPERM, os.strerror(errno.EPERM))
+
+    monkeypatch.setattr(os, "link", refused)
+    replace_calibration(calibrated, calibration_json(rig=RIG))
+    assert rig_in(calibrated) == rig()
+
+
+def test_a_link_to_a_bundle_stays_a_link(calibrated, calibration_json, tmp_path):
+    link = tmp_path / "current"
+    link.symlink_to(calibrated)
+    replace_calibration(link, calibration_json(rig=RIG))
+    assert link.is_symlink()
+    assert rig_in(calibrated) == rig()
+
+
+@pytest.mark.parametrize("failing", ["_sync", "sha256_of"])
+def test_a_full_disk_leaves_the_old_bundle(calibrated, calibration_json, monkeypatch, failing):
+    version = MapBundle.open(calibrated).manifest.version
+
+    def full(_):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(writer, failing, full)
+    with pytest.raises(BundleError, match=r"the calibration cannot be replaced \(No space left on device\)"):
+        replace_calibration(calibrated, calibration_json(rig=RIG))
+    monkeypatch.undo()
+    assert MapBundle.open(calibrated).manifest.version == version
+    assert [path.name for path in calibrated.parent.iterdir()] == ["town"]
+
+
+def test_ctrl_c_between_both_renames_brings_the_old_bundle_back(calibrated, calibration_json, monkeypatch):
+    version, rename = MapBundle.open(calibrated).manifest.version, type(calibrated).rename
+
+    def interrupted(source, target):
+        if source.name.endswith(".partial"):
+            raise KeyboardInterrupt
+        return rename(source, target)
+
+    monkeypatch.setattr(type(calibrated), "rename", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        replace_calibration(calibrated, calibration_json(rig=RIG))
+    monkeypatch.undo()
+    assert MapBundle.open(calibrated).manifest.version == version
+    assert [path.name for path in calibrated.parent.iterdir()] == ["town"]
+
+
+def test_a_killed_process_leaves_the_old_bundle(calibrated):
+    version = MapBundle.open(calibrated).manifest.version
+    program = textwrap.dedent(
+        """
+        import os, signal, sys
+        from pathlib import Path
+        from service.maps import writer
+
+        writer._put_in_place = lambda partial, out: os.kill(os.getpid(), signal.SIGKILL)
+        writer.replace_calibration(Path(sys.argv[1]), {"calibrated": False, "why": "a test"})
+        """
+    )
+    assert subprocess.run([sys.executable, "-c", program, str(calibrated)], check=False).returncode == -9
+    assert MapBundle.open(calibrated).manifest.version == version
+    assert all(child.name.endswith(".partial") for child in calibrated.parent.iterdir() if child != calibrated)
