@@ -20,6 +20,7 @@ from benchmarks.plans import BOTH, large_plan, paper_plan, unseen_plan
 from benchmarks.priors import prior_rows
 from benchmarks.raw import raw_condition_rows, raw_paper_rows, raw_rows, raw_unseen_rows
 from benchmarks.report import ROOT, Report
+from benchmarks.rigs import rig_rows
 from benchmarks.runs import Runs, share
 from benchmarks.sequences import sequence_rows
 from benchmarks.speed import speed_rows
@@ -31,8 +32,10 @@ from service.retrieval.encoder import Encoder
 
 #: Query sets of the unseen cities: the label of their rows, and the bar of R@1.
 UNSEEN = {
-    "drive1_precise": ("precise", 0.985), "drive1_stereo": ("stereo", 0.95), "blocked25_precise": ("precise_blocked_25", 0.90),
-}  # fmt: skip
+    "drive1_precise": ("precise", 0.985),
+    "drive1_stereo": ("stereo", 0.95),
+    "blocked25_precise": ("precise_blocked_25", 0.90),
+}
 
 
 def paper_rows(report: Report, runs: Runs, prefix: str, *, barred: bool) -> None:
@@ -123,8 +126,9 @@ def kitti_rows(report: Report, runs: Runs, data: Path) -> None:
     found = retrieve(Encoder.open(runs.encoder), kitti, drive, runs.work)
     count = int(found["n"])
     for row_id, value, bar in (
-        ("real.kitti_stereo.recall_at_1", found["recall_at_1"], 0.97), ("real.kitti_stereo.recall_at_5", found["recall_at_5"], None),
-    ):  # fmt: skip
+        ("real.kitti_stereo.recall_at_1", found["recall_at_1"], 0.97),
+        ("real.kitti_stereo.recall_at_5", found["recall_at_5"], None),
+    ):
         report.row(row_id, value, "share", bar=bar, n=count, ci95=list(wilson_interval(round(value * count), count)))
     best = max((k for k in found if k.startswith("raw_")), key=lambda k: found[k])
     report.row("raw.kitti_stereo.recall_at_1", found[best], "share", n=count, why=f"best setting: {best[4:]}")
@@ -159,6 +163,12 @@ def main() -> None:
     parser.add_argument(
         "--data", type=Path, default=ROOT.parent / "shared" / "data", help="folder of the real recordings"
     )
+    parser.add_argument(
+        "--calibration-work",
+        type=Path,
+        default=ROOT / "data" / "calibration",
+        help="folder of `streetfix calibrate` (part rigs)",
+    )
     parser.add_argument("--note", help="remark on this run for readers of the report")
     parser.add_argument(
         "--only", help="parts to run, separated by commas; the rows of the others stay, each with the run that made it"
@@ -177,6 +187,7 @@ def main() -> None:
         "sequences": lambda: sequence_rows(report, runs),
         "priors": lambda: prior_rows(report, runs),
         "heights": lambda: height_rows(report, runs),
+        "rigs": lambda: rig_rows(report, arguments.encoder, arguments.calibration_work),
         "unseen": lambda: unseen_rows(report, runs),
         "large": lambda: large_rows(report, runs),
         "paper": lambda: paper_rows(report, runs, "retrieval", barred=True),

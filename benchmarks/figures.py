@@ -17,7 +17,7 @@ from pathlib import Path
 from benchmarks.provenance import ROOT
 from model_training.stock import CALIBRATION
 from service.maps.calibration import Calibration, read_calibration
-from service.option_limits import FALSE_ACCEPT_RATE
+from service.option_limits import FALSE_ACCEPT_RATE, SAFE_CONFIDENCE
 
 REPORTS = ROOT / "reports"
 _FIGURE = re.compile(r"(<!-- figure: (\S+) (\S+) (\S+) -->)(.*?)(<!-- /figure -->)", re.DOTALL)
@@ -38,6 +38,7 @@ def stock_calibration() -> Calibration:
 #: Figures that documents may take from the code.
 CODE: dict[str, Callable[[], float]] = {
     "false_accept_rate": lambda: FALSE_ACCEPT_RATE,
+    "safe_confidence": lambda: SAFE_CONFIDENCE,
     "least_false_accept_rate": lambda: stock_calibration().least_false_accept_rate,
     "localized_from_confidence": lambda: stock_calibration().threshold(FALSE_ACCEPT_RATE),
 }

@@ -11,6 +11,7 @@ from benchmarks.report import Report
 from benchmarks.runs import Runs, share
 from model_training.evaluation.error_measures import distance_errors, heading_errors_deg
 from model_training.evaluation.measures import measure
+from model_training.evaluation.pose_errors import pose_errors
 from model_training.evaluation.predict import Predictions, headings_of, joined
 from service.geometry.rigid import heading_of_camera
 
@@ -85,10 +86,11 @@ def full_unseen_rows(report: Report, runs: Runs) -> None:
         middle = float(np.median(turned[accepted]))
         report.row(f"{row}.median_heading_error_deg", middle, "deg", bar=headings[preset], better="lower", n=count)
         near = accepted & (np.linalg.norm(answers.T_answer[:, :3, 3] - answers.T_true[:, :3, 3], axis=1) < 1.0)
-        errors, covariances = pose_errors(answers, near), answers.covariance[near]
+        errors, covariances = pose_errors(answers.T_answer[near], answers.T_true[near]), answers.covariance[near]
         for name, size in (("position", 3), ("full_pose", 6)):
             coverage[f"{name}.{preset}"] = consistent(errors[:, :size], covariances[:, :size, :size])
-        gaps |= {f"{axis}.{preset}": gap for axis, gap in sigma_gaps(answers, near, errors, covariances).items()}
+        towards = np.array([heading_of_camera(T) for T in answers.T_true[near]])
+        gaps |= {f"{axis}.{preset}": gap for axis, gap in sigma_gaps(towards, errors, covariances).items()}
         gross = int((accepted & ~near).sum())
         report.row(f"doubt.gross_errors.{preset}", gross / max(1, count), "share", better="lower", n=count)
     for name, value in coverage.items():
@@ -112,21 +114,6 @@ def _numbered(answers: Predictions) -> list[str]:
     return [str(number) for number in range(1 + int(max(answers.street_true.max(), answers.street_answer.max())))]
 
 
-def pose_errors(answers: Predictions, rows: NDArray[np.bool_]) -> NDArray[np.float64]:
-    """Return errors (n, 6) of translation (m) and rotation (rad) about map axes, in the covariance's order.
-
-    Args:
-        answers: answers with ground truth.
-        rows: mask (N,) of the answers to use.
-    """
-    T, truth = answers.T_answer[rows], answers.T_true[rows]
-    R = T[:, :3, :3] @ truth[:, :3, :3].transpose(0, 2, 1)
-    angle = np.arccos(np.clip((np.trace(R, axis1=1, axis2=2) - 1) / 2, -1, 1))
-    axis = np.stack([R[:, 2, 1] - R[:, 1, 2], R[:, 0, 2] - R[:, 2, 0], R[:, 1, 0] - R[:, 0, 1]], axis=1) / 2
-    scale = angle / np.maximum(np.sin(angle), 1e-12)
-    return np.concatenate([T[:, :3, 3] - truth[:, :3, 3], axis * scale[:, None]], axis=1)
-
-
 def consistent(errors: NDArray[np.float64], covariances: NDArray[np.float64]) -> float:
     """Return the share of normalised squared errors between the 2.5 % and 97.5 % quantiles of chi-square.
 
@@ -140,19 +127,17 @@ def consistent(errors: NDArray[np.float64], covariances: NDArray[np.float64]) ->
 
 
 def sigma_gaps(
-    answers: Predictions, rows: NDArray[np.bool_], errors: NDArray[np.float64], covariances: NDArray[np.float64]
+    heading: NDArray[np.float64], errors: NDArray[np.float64], covariances: NDArray[np.float64]
 ) -> dict[str, float]:
     """Return, per axis, the largest difference of 1, 2 and 3 sigma coverage from the normal distribution.
 
     Queries look along their street within 15 degrees, so the camera's heading stands for the street's.
 
     Args:
-        answers: answers with ground truth.
-        rows: mask (N,) of the answers to use.
+        heading: true heading of each camera, radians (n,).
         errors: errors (n, 6) of ``pose_errors``.
         covariances: covariances (n, 6, 6).
     """
-    heading = np.array([heading_of_camera(T) for T in answers.T_true[rows]])
     axes = np.zeros((4, len(heading), 6))
     axes[0, :, 0], axes[0, :, 1] = np.cos(heading), np.sin(heading)
     axes[1, :, 0], axes[1, :, 1] = -np.sin(heading), np.cos(heading)

@@ -2,8 +2,10 @@
 
 #: Default and upper limit of the option ``neighbours``.
 NEIGHBOURS, MOST_NEIGHBOURS = 5, 50
-#: Default share of the out-of-map queries in calibration that may be accepted. All kinds have equal weight (decisions 0039, 0084).
-FALSE_ACCEPT_RATE = 0.02
+#: Default share of the out-of-map queries in calibration that may be accepted. All kinds have equal weight (decisions 0039, 0149).
+FALSE_ACCEPT_RATE = 0.01
+#: Least confidence of a LOCALIZED answer at the default rate, and at lower ones. A higher rate accepts more answers.
+SAFE_CONFIDENCE = 0.9
 #: Lower limit of the option ``false_accept_rate``. No calibration could measure a lower rate.
 LEAST_FALSE_ACCEPT_RATE = 1e-6
 #: Limits of a camera's height above the ground, metres.

@@ -3,19 +3,23 @@
 Walls and rooms serve as out-of-map queries too.
 """
 
+import re
 from collections.abc import Callable, Sequence
 
 import numpy as np
 
 from model_training.calibration.fit import Asked
-from model_training.calibration.plans import BOTH, SEQUENCE
+from model_training.calibration.plans import SEQUENCE
 from model_training.calibration.rigs import Rig
 from model_training.calibration.strangers import KINDS, strangers
 from model_training.datasets.dataset import Dataset
+from model_training.evaluation.pose_errors import pose_errors
 from model_training.evaluation.predict import Predictions, predict
+from model_training.simulation.depth_noise import DepthModel
 from service.confidence.features import FEATURES
 from service.errors import NoDepthError
 from service.geometry.camera import PinholeCamera
+from service.geometry.rigid import heading_of_camera
 from service.localization.localizer import Localizer
 from service.maps.calibration import RIGHT_M
 from service.retrieval.query import Query
@@ -86,13 +90,20 @@ def where_streets_are_missing(
         predictions = predict(localizer, dataset, name, report=report)
         outside = is_outside(predictions.T_true[:, :2, 3])
         both = asked_of(predictions, name, known=True)
-        found.append(_rows(asked_of(predictions, f"removed_streets.{preset_of(name)}", known=False), outside))
-        found.append(_rows(both, ~outside))
+        found.append(asked_of(predictions, f"removed_streets.{preset_of(name)}", known=False).where(outside))
+        found.append(both.where(~outside))
     return found
 
 
 def walls_and_rooms(
-    localizer: Localizer, camera: PinholeCamera, seed: int, report: Report, *, count: int = 100, rig: Rig | None = None
+    localizer: Localizer,
+    camera: PinholeCamera,
+    seed: int,
+    report: Report,
+    models: Sequence[DepthModel],
+    *,
+    count: int = 100,
+    rig: Rig | None = None,
 ) -> list[Asked]:
     """Localize simulated walls and rooms, which no map contains.
 
@@ -101,19 +112,30 @@ def walls_and_rooms(
         camera: camera of the images.
         seed: seed of the random generator.
         report: called after every query.
-        count: number of queries of each kind and depth preset.
+        models: the depth cameras.
+        count: number of queries of each kind and depth camera.
         rig: rig of the queries; None for the camera itself.
     """
     found = []
     for number, kind in enumerate(KINDS):
-        for preset in BOTH:
-            rng = np.random.default_rng([seed, number, BOTH.index(preset)])
+        for order, model in enumerate(models):
+            rng = np.random.default_rng([seed, number, order])
             evidence = np.full((count, len(FEATURES)), np.nan)
-            for k, query in enumerate(strangers(kind, camera, preset, count, rng)):
+            for k, query in enumerate(strangers(kind, camera, model, count, rng)):
                 evidence[k] = _evidence(localizer, query if rig is None else rig.seen(query))
-                report(_by(rig, f"strangers {kind}_{preset}"), k + 1, count)
-            nowhere = np.zeros(count, bool)
-            found.append(Asked(evidence, nowhere, nowhere, np.full(count, _by(rig, f"{kind}.{preset}"))))
+                report(_by(rig, f"strangers {kind}_{model.name}"), k + 1, count)
+            found.append(
+                Asked(
+                    evidence=evidence,
+                    right=np.zeros(count, bool),
+                    known=np.zeros(count, bool),
+                    kind=np.full(count, _by(rig, f"{kind}.{model.name}")),
+                    family=np.full(count, model.name),
+                    error=np.full((count, 6), np.nan),
+                    covariance=np.full((count, 6, 6), np.nan),
+                    heading_rad=np.full(count, np.nan),
+                )
+            )
     return found
 
 
@@ -142,12 +164,12 @@ def _by(rig: Rig | None, kind: str) -> str:
 
 
 def preset_of(query_set: str) -> str:
-    """Return the depth preset of a query set: the last part of its name.
+    """Return the depth preset of a query set or a kind of queries: the last part of its name.
 
     Args:
-        query_set: name of the set.
+        query_set: name of the set or the kind.
     """
-    return query_set.rsplit("_", 1)[-1]
+    return re.split(r"[._]", query_set)[-1]
 
 
 def asked_of(predictions: Predictions, kind: str, *, known: bool) -> Asked:
@@ -163,8 +185,13 @@ def asked_of(predictions: Predictions, kind: str, *, known: bool) -> Asked:
     distance = np.linalg.norm(predictions.T_answer[:, :2, 3] - predictions.T_true[:, :2, 3], axis=1)
     right = (np.nan_to_num(distance, nan=np.inf) <= RIGHT_M) & known
     count = len(right)
-    return Asked(predictions.evidence, right, np.full(count, known), np.full(count, kind))
-
-
-def _rows(asked: Asked, keep: np.ndarray) -> Asked:
-    return Asked(asked.evidence[keep], asked.right[keep], asked.known[keep], asked.kind[keep])
+    return Asked(
+        evidence=predictions.evidence,
+        right=right,
+        known=np.full(count, known),
+        kind=np.full(count, kind),
+        family=np.full(count, preset_of(kind)),
+        error=pose_errors(predictions.T_answer, predictions.T_true) if known else np.full((count, 6), np.nan),
+        covariance=predictions.covariance,
+        heading_rad=np.array([heading_of_camera(T) if known else np.nan for T in predictions.T_true]),
+    )

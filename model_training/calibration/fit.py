@@ -1,18 +1,26 @@
-"""Fit a ``Calibration``: logistic regression by Newton's method, and thresholds from the out-of-map queries."""
+"""Fit a ``Calibration``: an additive model of the confidence, and thresholds from the out-of-map queries."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.stats import beta
 
-from service.confidence.features import FEATURES, RIVALRY, UNWEIGHED
+from model_training.calibration.additive import Penalty, fit_additive
+from service.confidence.features import FEATURES, TABLE, Feature
 from service.errors import DatasetError
-from service.maps.calibration import Calibration, Logistic, Threshold, expanded, probability, terms
+from service.maps.calibration import Calibration, FeatureStatistics, Threshold
+from service.option_limits import FALSE_ACCEPT_RATE, SAFE_CONFIDENCE
 
 #: False-accept rates with a threshold.
 RATES = (0.001, 0.002, 0.003, 0.005, 0.01, 0.02, 0.03, 0.05, 0.1)
-#: Strength of the ridge penalty, in queries. It had the smallest loss when each city was predicted from the others (decision 0084).
-RIDGE = 10.0
+#: Kinds of out-of-map queries.
+OUT_OF_MAP = ("other_city", "removed_streets", "wall", "room")
+#: Certainty of the upper bound of a false-accept rate.
+SURE = 0.95
+#: Strengths of the penalties on contributions and on changes of slope, in queries. They had the smallest loss when each rig family was
+#: predicted from the others (decision 0149).
+RIDGE, SMOOTH = 3.0, 3.0
 
 
 @dataclass(frozen=True)
@@ -24,20 +32,43 @@ class Asked:
         right: whether the position of the answer is right, within ``RIGHT_M`` (n,).
         known: whether the query lies in the map (n,).
         kind: kind of the query, for thresholds and tables (n,).
+        family: rig family of the query, for the cross-check (n,).
+        error: error of translation (m) and rotation (rad) about map axes; NaN outside of the map and without an answer (n, 6).
+        covariance: covariance of the answer, in the order of ``error``; NaN if there is none (n, 6, 6).
+        heading_rad: true heading of the camera, counter-clockwise from east; NaN outside of the map (n,).
     """
 
     evidence: NDArray[np.float64]
     right: NDArray[np.bool_]
     known: NDArray[np.bool_]
     kind: NDArray[np.str_]
+    family: NDArray[np.str_]
+    error: NDArray[np.float64]
+    covariance: NDArray[np.float64]
+    heading_rad: NDArray[np.float64]
 
     def __len__(self) -> int:
         return len(self.right)
 
     def registered(self) -> "Asked":
         """Return the queries with confidence features. The confidence of the others is always 0."""
-        keep = np.isfinite(self.evidence).all(axis=1)
-        return Asked(self.evidence[keep], self.right[keep], self.known[keep], self.kind[keep])
+        return self.where(np.asarray(np.isfinite(self.evidence).all(axis=1)))
+
+    def where(self, keep: NDArray[np.bool_]) -> "Asked":
+        """Return some of the queries.
+
+        Args:
+            keep: whether to keep each query (n,).
+        """
+        return Asked(*(getattr(self, name)[keep] for name in Asked.__dataclass_fields__))
+
+    def of_family(self, name: str) -> "Asked":
+        """Return the same queries as those of a rig family.
+
+        Args:
+            name: name of the family.
+        """
+        return replace(self, family=np.full(len(self), name))
 
 
 def pooled(parts: list[Asked]) -> Asked:
@@ -49,15 +80,25 @@ def pooled(parts: list[Asked]) -> Asked:
     return Asked(*(np.concatenate([getattr(part, name) for part in parts]) for name in Asked.__dataclass_fields__))
 
 
-def fit(asked: Asked, *, measured_on: dict[str, str | float], ridge: float = RIDGE) -> Calibration:
+def fit(
+    asked: Asked,
+    *,
+    measured_on: dict[str, str | float],
+    features: tuple[Feature, ...] = TABLE,
+    ridge: float = RIDGE,
+    smooth: float = SMOOTH,
+) -> Calibration:
     """Fit a calibration.
 
-    The queries in the map and the out-of-map queries have the same total weight, whatever their numbers.
+    All rig families have the same total weight, whatever their numbers of queries. In each of them, the queries in the map and the
+    out-of-map queries have the same total weight.
 
     Args:
         asked: the calibration data.
         measured_on: description of the data for the calibration file; ``calibration_for`` compares its ``encoder_sha256``.
-        ridge: strength of the penalty on the weights, in queries.
+        features: the features that the models may use, each with its sign.
+        ridge: strength of the penalty on the contributions, in queries.
+        smooth: strength of the penalty on changes of slope, in queries.
 
     Raises:
         DatasetError: the data lack right answers, wrong answers, queries in the map or out-of-map queries.
@@ -68,63 +109,109 @@ def fit(asked: Asked, *, measured_on: dict[str, str | float], ridge: float = RID
             "calibration needs right and wrong answers, and queries in the map and outside it; send "
             "more queries", field="queries"
         )  # fmt: skip
-    weight = np.where(used.known, 0.5 / used.known.mean(), 0.5 / (~used.known).mean())
-    mean, spread = used.evidence.mean(axis=0), used.evidence.std(axis=0) + 1e-9
-    right = _logistic(used.evidence, used.right, weight, mean, spread, ridge, without=UNWEIGHED)
-    known = _logistic(used.evidence, used.known, weight, mean, spread, ridge, without=RIVALRY + UNWEIGHED)
-    thresholds = _thresholds(asked, right)
-    return Calibration(
-        features=FEATURES, right=right, known=known, thresholds=thresholds, measured_on=measured_on | {"queries": len(asked)}
+    weight = weights_of(used)
+    weighted = tuple(feature for feature in features if feature.weighted)
+    penalty = Penalty(ridge, smooth)
+    right = fit_additive(used.evidence, used.right, weight, weighted, penalty)
+    alone = tuple(feature for feature in weighted if not feature.rivalry)
+    known = fit_additive(used.evidence, used.known, weight, alone, penalty)
+    mean, std = used.evidence.mean(axis=0), used.evidence.std(axis=0) + 1e-9
+    statistics = tuple(
+        FeatureStatistics(name=name, mean=float(mean[k]), std=float(std[k])) for k, name in enumerate(FEATURES)
+    )
+    flat = Threshold(false_accept_rate=0.5, confidence=1.0)  # replaced below: the thresholds need the models
+    found = Calibration(
+        features=statistics, right=right, known=known, thresholds=(flat,), measured_on=measured_on | {"queries": len(asked)}
     )  # fmt: skip
+    return found.model_copy(update={"thresholds": thresholds_of(asked, confidences(found, asked))})
 
 
-def _logistic(
-    evidence: NDArray[np.float64],
-    label: NDArray[np.bool_],
-    weight: NDArray[np.float64],
-    mean: NDArray[np.float64],
-    spread: NDArray[np.float64],
-    ridge: float,
-    *,
-    without: tuple[str, ...],
-) -> Logistic:
-    wide = expanded(evidence, tuple(mean), tuple(spread))
-    silent = [any(FEATURES[k] in without for k in term) for term in terms(len(FEATURES))]
-    wide[:, silent] = 0.0
-    design = np.c_[wide, np.ones(len(wide))]
-    penalty = np.r_[np.full(wide.shape[1], ridge), 1e-6]
-    w = np.zeros(design.shape[1])
-    for _ in range(100):
-        p = probability(design @ w)
-        gradient = design.T @ (weight * (p - label)) + penalty * w
-        curvature = (design * (weight * p * (1 - p))[:, None]).T @ design + np.diag(penalty)
-        step = np.linalg.solve(curvature, gradient)
-        w -= step * min(1.0, 5.0 / max(float(np.abs(step).max()), 1e-12))  # a full step far from the optimum overshoots
-        if np.abs(step).max() < 1e-9:
-            break
-    return Logistic(mean=tuple(mean), spread=tuple(spread), weights=tuple(w[:-1]), bias=float(w[-1]))
+def confidences(calibration: Calibration, asked: Asked) -> NDArray[np.float64]:
+    """Compute the confidence of every row (n,); 0 without registration.
 
-
-def _thresholds(asked: Asked, right: Logistic) -> tuple[Threshold, ...]:
-    """Return for each rate the confidence that at most this share of the out-of-map queries reaches.
-
-    All kinds of out-of-map queries have equal weight (decision 0039). The worst kind differs between cities, so its threshold would only be
-    the highest of several noisy ones.
+    Args:
+        calibration: the calibration.
+        asked: the data.
     """
-    confidence = np.zeros(len(asked))
+    found = np.zeros(len(asked))
     has = np.isfinite(asked.evidence).all(axis=1)
-    confidence[has] = probability(right.log_odds(asked.evidence[has]))
+    found[has] = calibration.confidence(asked.evidence[has])
+    return found
+
+
+def weights_of(asked: Asked) -> NDArray[np.float64]:
+    """Return the weight of each query (n,), on average 1: families count alike, and in each the map and its outside count alike.
+
+    Args:
+        asked: the calibration data.
+    """
+    weight = np.zeros(len(asked))
+    for family in np.unique(asked.family):
+        for known in (True, False):
+            rows = (asked.family == family) & (asked.known == known)
+            if rows.any():
+                weight[rows] = 1.0 / rows.sum()
+    return np.asarray(weight * (len(asked) / weight.sum()))
+
+
+def thresholds_of(asked: Asked, confidence: NDArray[np.float64]) -> tuple[Threshold, ...]:
+    """Return for each rate the least confidence at which the false-accept rate is at most this, with ``SURE`` certainty.
+
+    The bound of Clopper and Pearson (Biometrika 1934) covers the finite number of out-of-map queries. Another city, removed streets, walls
+    and rooms have equal weight (decision 0039), so the number of queries is the effective one of Kish (Survey Sampling, 1965). Rates that the data cannot
+    support have no threshold. At the default rate and below it, the threshold is at least ``SAFE_CONFIDENCE``.
+
+    Args:
+        asked: the calibration data.
+        confidence: confidence of each query (n,).
+
+    Raises:
+        DatasetError: the data support none of the rates.
+    """
     outside = ~asked.known
-    kinds, number, counts = np.unique(asked.kind[outside], return_inverse=True, return_counts=True)
-    weight = 1.0 / (len(kinds) * counts[number])
+    kinds = np.array([out_of_map_kind(str(kind)) for kind in asked.kind[outside]])
+    _, number, counts = np.unique(kinds, return_inverse=True, return_counts=True)
+    weight = 1.0 / (len(counts) * counts[number])
+    effective = 1.0 / float((weight**2).sum())
     order = np.argsort(-confidence[outside], kind="stable")
     ranked, passed = confidence[outside][order], np.cumsum(weight[order])
+    bound = upper_bound(passed * effective, effective)
     found = []
     for rate in RATES:
-        first_refused = min(int(np.searchsorted(passed, rate * (1 + 1e-9), side="right")), len(ranked) - 1)
+        if upper_bound(np.zeros(1), effective)[0] > rate:
+            continue
+        first_refused = min(int(np.searchsorted(bound, rate * (1 + 1e-9), side="right")), len(ranked) - 1)
         level = float(min(1.0, np.nextafter(ranked[first_refused], 2.0)))
+        if rate <= FALSE_ACCEPT_RATE:
+            level = max(level, SAFE_CONFIDENCE)
         found.append(Threshold(false_accept_rate=rate, confidence=level))
+    if not found:
+        raise DatasetError(
+            f"calibration has {effective:.0f} effective out-of-map queries, which support no false-accept rate of "
+            f"{RATES[-1]:g} or less; send more queries from outside the map", field="queries",
+        )  # fmt: skip
     return tuple(found)
+
+
+def out_of_map_kind(kind: str) -> str:
+    """Return the kind of an out-of-map query without the names of its rig and its depth preset.
+
+    Args:
+        kind: kind of the query, such as ``car_other_city.sgbm``.
+    """
+    without_preset = kind.split(".", maxsplit=1)[0]
+    return next((name for name in OUT_OF_MAP if without_preset.endswith(name)), without_preset)
+
+
+def upper_bound(accepted: NDArray[np.float64], queries: float) -> NDArray[np.float64]:
+    """Return the upper Clopper-Pearson bounds of a rate, with ``SURE`` certainty.
+
+    Args:
+        accepted: numbers of accepted queries; effective numbers need not be whole (n,).
+        queries: number of queries.
+    """
+    rest = np.maximum(queries - accepted, 1e-9)
+    return np.asarray(np.where(accepted >= queries, 1.0, beta.ppf(SURE, accepted + 1.0, rest)))
 
 
 def expected_calibration_error(confidence: NDArray[np.float64], right: NDArray[np.bool_], *, bins: int = 15) -> float:

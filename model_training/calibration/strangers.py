@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from model_training.simulation.conditions import CONDITIONS
-from model_training.simulation.depth_noise import DEPTHS, measured_depth
+from model_training.simulation.depth_noise import DepthModel, measured_depth
 from service.geometry.camera import PinholeCamera
 from service.geometry.rigid import rotation_x, rotation_z
 from service.retrieval.query import Query
@@ -109,21 +109,23 @@ def _ground(rng: np.random.Generator) -> float:
 KINDS: dict[str, Callable[[np.random.Generator], list[Box]]] = {"wall": wall, "room": room}
 
 
-def strangers(kind: str, camera: PinholeCamera, preset: str, count: int, rng: np.random.Generator) -> Iterator[Query]:
-    """Yield out-of-map queries of one kind, with the depth noise of a preset, tilted by a few degrees like a robot's camera.
+def strangers(
+    kind: str, camera: PinholeCamera, model: DepthModel, count: int, rng: np.random.Generator
+) -> Iterator[Query]:
+    """Yield out-of-map queries of one kind, with the errors of a depth camera, tilted by a few degrees like a robot's camera.
 
     Args:
         kind: one of ``KINDS``.
         camera: camera of the RGB and the depth image.
-        preset: depth preset, one of ``DEPTHS``.
+        model: the depth camera.
         count: number of queries.
         rng: random generator.
     """
     for _ in range(count):
-        yield _picture(KINDS[kind](rng), camera, preset, rng)
+        yield _picture(KINDS[kind](rng), camera, model, rng)
 
 
-def _picture(boxes: list[Box], camera: PinholeCamera, preset: str, rng: np.random.Generator) -> Query:
+def _picture(boxes: list[Box], camera: PinholeCamera, model: DepthModel, rng: np.random.Generator) -> Query:
     pitch, roll = np.deg2rad(rng.normal(0, 2.0, 2))
     rays = camera.rays_of_pixels() @ (rotation_x(pitch) @ rotation_z(roll)).T
     depths = np.stack([box.entered(rays) for box in boxes])
@@ -132,7 +134,7 @@ def _picture(boxes: list[Box], camera: PinholeCamera, preset: str, rng: np.rando
     there = depth < _FAR
     bare = rng.random(len(boxes)) < 0.5  # without texture, so stereo matching returns wrong depth there
     measured = measured_depth(
-        np.where(there, depth, 0).astype(np.float32), bare[seen] & there, DEPTHS[preset], CONDITIONS["clear"], rng
+        np.where(there, depth, 0).astype(np.float32), bare[seen] & there, model, CONDITIONS["clear"], rng
     )
     colours = rng.uniform(40, 210, (len(boxes), 1)) + rng.normal(0, 15, (len(boxes), 3))
     light = np.where(there[..., None], colours[seen], 235.0) + rng.normal(0, 4, (*seen.shape, 1))

@@ -1,5 +1,7 @@
 """``streetfix calibrate``."""
 
+import time
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated
 
@@ -7,39 +9,183 @@ import typer
 from rich.console import Console
 
 from model_training.calibration.make import calibrate
+from model_training.calibration.own_drive import frames_of_drive
+from model_training.calibration.own_rig import learn_correction, report_lines, with_correction
+from model_training.calibration.rendered_rig import RigFile, frames_of_rig, read_rig
 from model_training.cli.progress import bars
+from model_training.datasets.dataset import Dataset, require_map_first
+from model_training.mapping.build import describe
 from model_training.stock import CALIBRATION, ENCODER
-from service.errors import DatasetError
+from service.errors import BundleError, DatasetError
+from service.localization.localizer import Localizer
+from service.maps.calibration import Calibration
+from service.maps.reader import MapBundle
+from service.maps.writer import replace_calibration
+
+#: Folder of cities, maps and answers if none is given.
+WORK = Path("data/calibration")
+#: Standard deviation of the end point of an odometry as a share of the distance, and queries at a time, if none is given.
+ODOMETRY_NOISE, WORKERS = 0.02, 2
 
 
 def command(
     encoder: Annotated[
-        Path, typer.Option(help="ONNX file of `streetfix export`.  [default: the stock encoder]", show_default=False)
-    ] = ENCODER,
+        Path | None, typer.Option(help="ONNX file of `streetfix export`.  [default: the stock encoder]")
+    ] = None,
     out: Annotated[
-        Path,
-        typer.Option(help="Calibration file to write, JSON.  [default: beside the stock encoder]", show_default=False),
-    ] = CALIBRATION,
-    work: Annotated[Path, typer.Option(help="Folder that keeps cities, maps and answers.")] = Path("data/calibration"),
-    anew: Annotated[bool, typer.Option(help="Send all queries again, even if their answers are stored.")] = False,
+        Path | None,
+        typer.Option(
+            help="Calibration file to write, JSON.  [default: beside the stock encoder]  With --map it is for `build-map "
+            "--calibration`. Without it, --map writes the correction into the map."
+        ),
+    ] = None,
+    work: Annotated[
+        Path | None, typer.Option(help=f"Folder that keeps cities, maps and answers.  [default: {WORK}]")
+    ] = None,
+    anew: Annotated[
+        bool, typer.Option("--anew", help="Send all queries again, even if their answers are stored.")
+    ] = False,
+    map_bundle: Annotated[
+        Path | None,
+        typer.Option(
+            "--map", help="Map bundle. Learn how its confidence must be corrected for a rig: give --drive or --rig."
+        ),
+    ] = None,
+    drive: Annotated[
+        Path | None,
+        typer.Option(
+            help="Dataset folder with images of the rig, and with ground truth or odometry, in the map frame."
+        ),
+    ] = None,
+    queries: Annotated[
+        list[str] | None, typer.Option(help="Query set of --drive. Repeat for several.  [default: all]")
+    ] = None,
+    odometry_noise: Annotated[
+        float | None,
+        typer.Option(
+            help="Standard deviation of the end point of --drive's odometry, as a share of the distance.  [default: 0.02]",
+            min=0.0,
+            max=0.5,
+        ),
+    ] = None,
+    rig: Annotated[
+        Path | None,
+        typer.Option(
+            help="JSON file of a rig. Its images are rendered from the map. They can only lower the confidence."
+        ),
+    ] = None,
+    workers: Annotated[
+        int | None, typer.Option(help="With --map: queries that run at a time.  [default: 2]", min=1)
+    ] = None,
 ) -> None:
-    """Fit the confidence of an encoder on calibration cities.
+    """Fit the confidence of an encoder on calibration cities, or correct the confidence of a map for a rig.
 
-    The command simulates these cities. It takes about half an hour.
+    The first simulates the cities, which takes about half an hour. The second takes seconds to minutes.
 
     \b
-    Example:
+    Examples:
       streetfix calibrate --encoder runs/mine/encoder.onnx --out runs/mine/calibration.json
       streetfix build-map data/site --encoder runs/mine/encoder.onnx --calibration runs/mine/calibration.json --out maps/site
+      streetfix calibrate --map maps/site --drive data/robot --queries recorded
+      streetfix calibrate --map maps/site --rig rig.json --out rig_calibration.json
     """
-    if not out.parent.is_dir():  # said before the work, not after it
+    of_drive = {"--queries": queries, "--odometry-noise": odometry_noise}
+    if out is not None and not out.parent.is_dir():  # said before the work, not after it
         raise DatasetError(f"--out: folder {out.parent} not found; create it first", field="out")
+    if map_bundle is None:
+        if given := _given({"--drive": drive, "--rig": rig, "--workers": workers, **of_drive}):
+            raise typer.BadParameter(f"{given} corrects the confidence of a map; give the map with --map")
+        _calibrate_encoder(encoder or ENCODER, out or CALIBRATION, work or WORK, anew=anew)
+        return
+    if given := _given({"--encoder": encoder, "--work": work, "--anew": anew or None}):
+        raise typer.BadParameter(f"--map uses the encoder and the calibration of the map; leave out {given}")
+    if drive is None and (given := _given(of_drive)):
+        raise typer.BadParameter(f"{given} belongs to --drive; give the recording with --drive")
+    if out is not None and out.resolve().is_relative_to(map_bundle.resolve()):
+        raise DatasetError(
+            f"--out: {out} lies in the map bundle, and its manifest would no longer fit; leave out --out to correct this map",
+            field="out",
+        )
+    frames_from = _source(map_bundle, drive, rig)
+    noise = ODOMETRY_NOISE if odometry_noise is None else odometry_noise
+    _calibrate_rig(map_bundle, frames_from, queries or [], noise, out, workers or WORKERS)
+
+
+def _given(options: Mapping[str, object]) -> str:
+    """Return the name of the first given option; empty if none is given."""
+    return next((name for name, value in options.items() if value is not None), "")
+
+
+def _source(map_bundle: Path, drive: Path | None, rig: Path | None) -> Dataset | RigFile:
+    """Open the recording or the rig file. Exactly one of both must be given."""
+    if drive is not None and rig is None:
+        require_map_first(map_bundle, drive, "calibrate --map ... --drive")
+        return Dataset(drive)
+    if rig is not None and drive is None:
+        return read_rig(rig)
+    raise typer.BadParameter("--map needs either --drive or --rig")
+
+
+def _calibrate_encoder(encoder: Path, out: Path, work: Path, *, anew: bool) -> None:
     console = Console(highlight=False)
     with bars() as report:
         calibration, checks = calibrate(work, encoder, anew=anew, report=report)
     for line in checks:
         console.print(line, soft_wrap=True)
-    part = out.with_name(out.name + ".part")
-    part.write_text(calibration.model_dump_json(indent=1) + "\n")
-    part.rename(out)
+    _write(out, calibration)
     console.print(f"written: {out}")
+
+
+def _calibrate_rig(
+    folder: Path, source: Dataset | RigFile, queries: list[str], odometry_noise: float, out: Path | None, workers: int
+) -> None:
+    began = time.monotonic()
+    console = Console(highlight=False, soft_wrap=True)
+    bundle = MapBundle.open(folder)
+    calibration = bundle.calibration
+    if calibration is None:
+        raise BundleError(
+            f"{folder}: the map is not calibrated, so there is no confidence to correct; fit one with `streetfix calibrate --encoder`, "
+            "and build the map with `--calibration`",
+            field="calibration.json",
+        )
+    localizer = Localizer.open(bundle)
+    if isinstance(source, RigFile):
+        with bars() as report:
+            frames = frames_of_rig(localizer, source, workers=workers, report=report)
+        measured_on = f"images rendered for {source.name}"
+        correction = learn_correction(calibration, frames, source="rendered", measured_on=measured_on)
+    else:
+        with bars() as report:
+            found = frames_of_drive(
+                localizer, source, queries, odometry_noise=odometry_noise, workers=workers, report=report
+            )
+        console.print(f"recording: {found.described}")
+        for count, what in (
+            (found.unlabelled, "have no label"),
+            (found.unregistered, "have too few points to register"),
+        ):
+            if count:
+                console.print(f"left out: {count} images {what}")
+        correction = learn_correction(
+            calibration, found.frames, source="drive", measured_on=found.described, label_noise=found.label_noise
+        )
+    for line in report_lines(correction):
+        console.print(line)
+    console.print(f"took_s: {time.monotonic() - began:.1f}")
+    corrected = with_correction(calibration, correction)
+    if out is None:
+        console.print(f"{describe(replace_calibration(folder, corrected.model_dump(mode='json')))}: {folder}")
+    else:
+        _write(out, corrected)
+        console.print(f"written: {out}")
+
+
+def _write(out: Path, calibration: Calibration) -> None:
+    """Write a calibration file that appears complete or not at all."""
+    part = out.with_name(out.name + ".part")
+    try:
+        part.write_text(calibration.model_dump_json(indent=1) + "\n")
+        part.rename(out)
+    finally:
+        part.unlink(missing_ok=True)

@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from model_training.mapping.rendered_query import grey_image, noisy_depth
 from service.geometry.camera import PinholeCamera
 from service.geometry.rigid import R_BODY_OPTICAL, rotation_z, transform_from
 from service.imaging.view_grid import ViewGrid, panorama_from_points
@@ -31,6 +32,8 @@ _EACH = 25
 _CAMERA = PinholeCamera(320, 240, 160.0, 160.0, 159.5, 119.5)
 #: Noise of disparity of the presets precise and stereo, pixels; the queries alternate between them. Focal length times baseline, px m.
 _NOISE_PX, _FOCAL_BASELINE = (0.1, 0.5), 80.0
+#: Largest depth of a rendered query, metres.
+_LARGEST_M = 60.0
 #: Largest error of a right answer, metres on the ground.
 _RIGHT_M = 1.0
 #: Standard deviation of the prior of the offset, in log odds (decision 0030).
@@ -88,7 +91,7 @@ def site_of(
         for number, scan in enumerate(held):
             query, T_map_camera = _drawn(scan, content.grid, number)
             answer = localizer.localize(query)
-            odds = None if answer.evidence is None else float(calibration.right.log_odds(answer.evidence))
+            odds = None if answer.evidence is None else float(calibration.log_odds("right", answer.evidence))
             confidence.append(-30.0 if odds is None else odds)
             right.append(float(np.linalg.norm(answer.T_map_camera_guess[:2, 3] - T_map_camera[:2, 3])) <= _RIGHT_M)
             report("site check", number + 1, len(held))
@@ -112,9 +115,11 @@ def _offset(odds: NDArray[np.float64], right: NDArray[np.bool_]) -> float:
 def _to_check(content: BundleContent) -> BundleContent:
     """Return the map without calibration, preview and the brightness of its cloud."""
     return replace(
-        content, calibration={"calibrated": False, "why": "the calibration is being checked"}, preview_webp=b"",
+        content,
+        calibration={"calibrated": False, "why": "the calibration is being checked"},
+        preview_webp=b"",
         cloud=None if content.cloud is None else replace(content.cloud, brightness=None),
-    )  # fmt: skip
+    )
 
 
 def _drawn(scan: HeldScan, grid: ViewGrid, number: int) -> tuple[Query, NDArray[np.float64]]:
@@ -129,15 +134,15 @@ def _drawn(scan: HeldScan, grid: ViewGrid, number: int) -> tuple[Query, NDArray[
     column = np.rint((azimuth + np.pi) / (2 * np.pi) * grid.around).astype(int) % grid.around
     inside = (row >= 0) & (row < grid.rows)
     cell = np.where(inside, row, 0), column
-    # Noise of the inverse depth. Half of its variance differs from beam to beam, half from pixel to pixel.
-    noise = _NOISE_PX[number % 2] / _FOCAL_BASELINE * np.sqrt(0.5)
-    of_beam, of_pixel = rng.normal(0, noise, panorama[0].shape), rng.normal(0, noise, rays.shape[:2])
-    z = np.where(inside, panorama[0][cell], 0) / np.linalg.norm(rays, axis=-1)
-    inverse = np.where(z > 0, 1 / np.where(z > 0, z, 1) + of_beam[cell] + of_pixel, 0)
-    depth_m = np.where(inverse > 1 / 60.0, 1 / np.where(inverse > 0, inverse, 1), 0).astype(np.float32)
-    intensity = np.where(inside, panorama[1][cell], 0)
-    middle = float(np.median(intensity[intensity > 0])) if (intensity > 0).any() else 1.0
-    grey = np.clip(110 * intensity / middle, 0, 255)
-    rgb = np.repeat(grey.astype(np.uint8)[..., None], 3, axis=2)
+    # Half of the noise's variance differs from beam to beam, half from pixel to pixel.
+    depth_m = noisy_depth(
+        np.where(inside, panorama[0][cell], 0) / np.linalg.norm(rays, axis=-1),
+        _NOISE_PX[number % 2] / _FOCAL_BASELINE,
+        cell[0] * grid.around + cell[1],
+        grid.rows * grid.around,
+        rng,
+        largest_m=_LARGEST_M,
+    )
+    rgb = grey_image(np.where(inside, panorama[1][cell], np.float32(0)))
     T_map_camera = scan.T_map_level @ transform_from(R_level_camera, np.zeros(3))
     return Query(rgb=rgb, depth_m=depth_m, camera=_CAMERA, down_camera=-R_level_camera[2]), T_map_camera

@@ -74,7 +74,10 @@ def command(
     ] = None,
     false_accept_rate: Annotated[
         float | None,
-        typer.Option(help="Share of out-of-map queries that may get the status LOCALIZED.  [default: 0.02]"),
+        typer.Option(
+            help="Share of out-of-map queries that may get the status LOCALIZED. A higher rate than the default also accepts a "
+            "confidence below 0.9.  [default: 0.01]"
+        ),
     ] = None,
 ) -> None:
     """Serve maps over HTTP and gRPC.

@@ -4,7 +4,10 @@ import numpy as np
 from jaxtyping import Float64
 from numpy.typing import NDArray
 
-from service.maps.calibration import CLIP, Calibration, terms
+from service.maps.calibration import Calibration
+
+#: Width of the margin beyond the knots of a term, as a share of the distance between the first and the last.
+MARGIN = 0.1
 
 
 def extrapolated(
@@ -12,7 +15,8 @@ def extrapolated(
 ) -> tuple[tuple[str, float], ...]:
     """Return the features that the confidence uses and that lie outside the range of the calibration data.
 
-    The range ends where the confidence stops to follow a feature: ``CLIP`` standard deviations from the mean.
+    The confidence does not follow a feature beyond the first and the last knot of its term. The range is wider by ``MARGIN`` of the
+    distance between them on either side, because a few of the calibration's own queries lie just outside.
 
     Args:
         calibration: calibration of the map.
@@ -23,8 +27,11 @@ def extrapolated(
     """
     if evidence is None:
         return ()
-    right = calibration.right
-    away = (evidence - np.array(right.mean)) / np.array(right.spread)
-    used = {k for term, weight in zip(terms(len(away)), right.weights, strict=True) if weight != 0 for k in term}
-    outside = [(calibration.features[k], float(away[k])) for k in used if abs(away[k]) > CLIP]
+    away = calibration.deviations(evidence)
+    outside = []
+    for term in calibration.right.terms:
+        column = calibration.names.index(term.feature)
+        margin = MARGIN * (term.knots[-1] - term.knots[0])
+        if not term.knots[0] - margin <= evidence[column] <= term.knots[-1] + margin:
+            outside.append((term.feature, float(away[column])))
     return tuple(sorted(outside, key=lambda each: (-abs(each[1]), each[0])))

@@ -27,6 +27,7 @@ OTHER_PLACE_M, VOTE_M, VOTERS = 10.0, 5.0, 20
 _NEAREST = 5  # number of the most similar neighbours in ``pose_spread``
 _MOST_MARGIN = 12.0  # nats; largest margin, also used if there is no rival
 _MOST_PLACE_M = 10.0
+_LEAST_MAPPED = 0.05
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,6 +60,11 @@ class Evidence:
         """Statistics of the reference's view along its optical axis."""
         views = self.frames[0].views
         return shape_of(views.planes[int(np.argmin(np.abs(views.turns_rad))), 0], self.grid)
+
+    @property
+    def mapped_share(self) -> float:
+        """Share of the points where the map shows a surface from the best pose, at least ``_LEAST_MAPPED``."""
+        return max(1.0 - self.best.scores["unmapped"], _LEAST_MAPPED)
 
     @cached_property
     def support_gaps(self) -> Float64[NDArray[np.float64], " C"]:
@@ -128,25 +134,32 @@ class Feature:
 #:
 #: ``log_share`` has no weight, because it is a separate rule beside the confidence (``service.confidence.decision``, decision
 #: 0086). ``similarity`` has none, because it depends more on the kind of street than on the place. Real streets lie four
-#: standard deviations below simulated streets (decision 0137).
+#: standard deviations below simulated streets (decision 0137). The others without a weight gained nothing on rig families that
+#: were left out of the fit (decision 0149). They still serve ``reasons``.
 TABLE: tuple[Feature, ...] = (
     Feature("margin", "nat", "support gap to the best rival", 1,
             lambda e: float(e.support_gaps[1:].min(initial=_MOST_MARGIN)), rivalry=True),
-    Feature("inliers", "1", "share of the points that lie on the map", 1, lambda e: e.best.registered.inliers),
+    Feature("inliers", "1", "share of the points that lie on the map", 1, lambda e: e.best.registered.inliers, weighted=False),
+    Feature("mapped_inliers", "1", "the same, relative to the share where the map shows a surface", 1,
+            lambda e: e.best.registered.inliers / e.mapped_share),
     Feature("similarity", "1", "descriptor similarity to the places around the pose", 1,
             lambda e: e.best.scores["similarity"], weighted=False),
     Feature("similarity_margin", "1", "similarity at the pose minus the best similarity elsewhere", 1,
             lambda e: e.similarity_margin, rivalry=True),
-    Feature("likelihood", "nat", "mean log likelihood of the rendered depth", 1, lambda e: e.best.scores["likelihood"]),
-    Feature("through", "1", "share of the points behind the mapped surfaces", -1, lambda e: e.best.scores["through"]),
-    Feature("front", "1", "share of the points in front of the mapped surfaces", -1, lambda e: e.best.scores["front"]),
-    Feature("unmapped", "1", "share of the points where the map shows nothing", -1, lambda e: e.best.scores["unmapped"]),
-    Feature("log_sigma", "log m", "larger horizontal standard deviation of the pose", -1,
-            lambda e: float(np.log(float(np.sqrt(np.linalg.eigvalsh(e.refined.covariance[:2, :2])[-1]))))),
+    Feature("likelihood", "nat", "mean log likelihood of the rendered depth", 1, lambda e: e.best.scores["likelihood"],
+            weighted=False),
+    Feature("through", "1", "share of the mapped points behind the map's surfaces", -1,
+            lambda e: e.best.scores["through"] / e.mapped_share),
+    Feature("front", "1", "share of the mapped points in front of the map's surfaces", -1,
+            lambda e: e.best.scores["front"] / e.mapped_share),
+    Feature("unmapped", "1", "share of the points where the map shows nothing", -1, lambda e: e.best.scores["unmapped"],
+            weighted=False),
+    Feature("log_sigma", "log m", "larger horizontal standard deviation of the registration", -1,
+            lambda e: float(np.log(float(np.sqrt(np.linalg.eigvalsh(e.refined.registration_covariance[:2, :2])[-1]))))),
     Feature("scale", "1 %", "estimated scale error of the depth, unsigned", -1,
             lambda e: abs(float(np.log(e.best.registered.scale))) / 0.01),
     Feature("votes", "1", "neighbours within 5 m of the pose, as a share of the places there", 1,
-            lambda e: e.votes, rivalry=True),
+            lambda e: e.votes, rivalry=True, weighted=False),
     Feature("entropy", "nat", "entropy of the clusters' weights", -1, lambda e: e.entropy, rivalry=True),
     Feature("log_noise", "log 1/m", "standard deviation of the inverse depth of one pixel", -1,
             lambda e: float(np.log(np.median([frame.noise for frame in e.frames])))),
@@ -160,7 +173,7 @@ TABLE: tuple[Feature, ...] = (
     Feature("residual", "log 1", "disagreement of the image's patches about the pose, relative to their noise", -1,
             lambda e: float(np.log(e.refined.disagreement))),
     Feature("pose_spread", "log m", "distance of the first five neighbours from their mean", -1,
-            lambda e: e.pose_spread, rivalry=True),
+            lambda e: e.pose_spread, rivalry=True, weighted=False),
     Feature("log_share", "log 1", "share of the best candidate in the support of all candidates that exclude each other", 1,
             lambda e: float(log_shares(e.support_gaps)[0]), weighted=False),
 )  # fmt: skip
@@ -205,7 +218,7 @@ def require_features(calibration: Calibration | None, path: str) -> None:
     Raises:
         BundleError: the names or their order differ.
     """
-    if calibration is not None and calibration.features != FEATURES:
+    if calibration is not None and calibration.names != FEATURES:
         raise BundleError(
             f"{path}: the confidence features are not those of this release ({', '.join(FEATURES)}); build the map again",
             field="calibration.json",

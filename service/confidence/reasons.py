@@ -38,8 +38,7 @@ class Reason:
     remedy: str
 
 
-#: Possible causes, the likeliest first: name, confidence features that indicate it, remedy. Features without a weight in the
-#: confidence (``UNWEIGHED``) are left out.
+#: Possible causes, the likeliest first: name, confidence features that indicate it, remedy. ``similarity`` and ``log_share`` indicate none.
 GROUPS: tuple[tuple[str, tuple[str, ...], str], ...] = (
     ("intrinsics", ("facings",), "compare fx, fy, cx, cy and the image size with the calibration of the camera"),
     ("depth unit", ("scale",), "check depth.scale_m and depth.kind (metres for each stored unit; z or range)"),
@@ -49,7 +48,7 @@ GROUPS: tuple[tuple[str, tuple[str, ...], str], ...] = (
     ),
     ("baseline", ("log_noise", "points", "log_sigma"), "check the stereo baseline (depth.baseline_m) and the noise of the depth"),
     (
-        "traffic in the map", ("through", "front", "inliers", "unmapped", "likelihood"),
+        "traffic in the map", ("through", "front", "mapped_inliers", "inliers", "unmapped", "likelihood"),
         "build the map with the traffic vote, and look for changes since the survey",
     ),
     (
@@ -84,7 +83,7 @@ def reasons_of(
 def _by_evidence(calibration: Calibration, evidence: Float64[NDArray[np.float64], " F"] | None) -> tuple[Reason, ...]:
     if evidence is None:
         return (_TOO_LITTLE,)
-    away = (evidence - np.array(calibration.right.mean)) / np.array(calibration.right.spread)
+    away = calibration.deviations(evidence)
     found = []
     for check, names, remedy in GROUPS:
         deviations = ((name, float(away[FEATURES.index(name)])) for name in names)

@@ -1,7 +1,7 @@
 """``calibration.json``: maps the confidence features of an answer to the probability that its position is right."""
 
 import json
-from functools import cache
+from itertools import pairwise
 from typing import ClassVar, Literal
 
 import numpy as np
@@ -11,8 +11,6 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 
 from service.errors import BundleError
 
-#: Limit of a normalised feature, standard deviations. It stops extrapolation beyond the calibration data.
-CLIP = 4.0
 #: Largest distance of a right answer from the ground truth, metres on the ground. Confidence is the probability of a right answer.
 RIGHT_M = 1.0
 
@@ -21,60 +19,57 @@ class _Frozen(BaseModel):
     model_config: ClassVar[ConfigDict] = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
 
-class Logistic(_Frozen):
-    """Logistic regression over the features, their squares and all products of two features.
+class Term(_Frozen):
+    """Contribution of one confidence feature to the log odds: a piecewise linear function.
+
+    Beyond its first and last knot the contribution is constant, so the confidence does not extrapolate.
 
     Attributes:
-        mean: mean of each feature. Normalisation subtracts it.
-        spread: standard deviation of each feature. Normalisation divides by it.
-        weights: weights of the features, then of the products, in the order of ``terms``.
-        bias: log odds where all normalised features are 0.
+        feature: name of the feature.
+        knots: values of the feature, rising, in the feature's unit.
+        log_odds: contribution at each knot.
     """
 
-    mean: tuple[float, ...]
-    spread: tuple[float, ...]
-    weights: tuple[float, ...]
+    feature: str
+    knots: tuple[float, ...] = Field(min_length=2)
+    log_odds: tuple[float, ...]
+
+    @model_validator(mode="after")
+    def _rising(self) -> "Term":
+        if len(self.log_odds) != len(self.knots):
+            raise ValueError(f"{self.feature}: {len(self.knots)} knots need as many log_odds, not {len(self.log_odds)}")
+        if any(after <= before for before, after in pairwise(self.knots)):
+            raise ValueError(f"{self.feature}: knots must rise")
+        return self
+
+
+class AdditiveModel(_Frozen):
+    """Generalized additive logistic model (Hastie and Tibshirani, Statistical Science 1986): a sum of functions of single features.
+
+    It has no products of features. A product would reach values that no calibration rig had as soon as a new rig moves two features.
+
+    Attributes:
+        terms: contributions of the features. Features without a term do not count.
+        bias: log odds without any contribution.
+    """
+
+    terms: tuple[Term, ...]
     bias: float
 
     @model_validator(mode="after")
-    def _positive(self) -> "Logistic":
-        if min(self.spread, default=1.0) <= 0:
-            raise ValueError("spread must be positive")
+    def _distinct(self) -> "AdditiveModel":
+        names = [term.feature for term in self.terms]
+        if len(set(names)) != len(names):
+            raise ValueError("terms: a feature has two terms")
         return self
 
-    def log_odds(self, evidence: Float64[NDArray[np.float64], "*n F"]) -> Float64[NDArray[np.float64], "*n"]:
-        """Return the log odds for one or more rows of features.
 
-        Args:
-            evidence: confidence features in the order of ``features``.
-        """
-        return np.asarray(expanded(evidence, self.mean, self.spread) @ np.array(self.weights) + self.bias)
+class FeatureStatistics(_Frozen):
+    """Mean and standard deviation of a feature in the calibration data, in the feature's unit."""
 
-
-def expanded(
-    evidence: Float64[NDArray[np.float64], "*n F"], mean: tuple[float, ...], spread: tuple[float, ...]
-) -> Float64[NDArray[np.float64], "*n T"]:
-    """Normalise features and append their squares and products of two, in the order of ``terms``.
-
-    Args:
-        evidence: confidence features, a row per answer.
-        mean: mean of each feature.
-        spread: standard deviation of each feature.
-    """
-    z = np.clip((evidence - np.array(mean)) / np.array(spread), -CLIP, CLIP)
-    one, other = np.triu_indices(z.shape[-1])
-    wide: Float64[NDArray[np.float64], "*n T"] = np.concatenate([z, z[..., one] * z[..., other]], axis=-1)
-    return wide
-
-
-@cache
-def terms(count: int) -> tuple[tuple[int, ...], ...]:
-    """Return for each term of ``expanded`` the indices of the features that it multiplies.
-
-    Args:
-        count: number of features.
-    """
-    return (*((k,) for k in range(count)), *((j, k) for j in range(count) for k in range(j, count)))
+    name: str
+    mean: float
+    std: float = Field(gt=0)
 
 
 class Threshold(_Frozen):
@@ -109,33 +104,86 @@ class Site(_Frozen):
     expected_calibration_error: float = Field(ge=0, le=1)
 
 
+class RigCorrection(_Frozen):
+    """Correction of the confidence for a camera rig, learned from images of this rig in this map (decision 0150).
+
+    The corrected log odds are ``scale * log_odds + offset``. With ``lower_only`` they are never larger than the log odds themselves. The
+    scale is positive, so the order of answers stays the same. The thresholds stay as they are. The calibration errors come from
+    cross-validation over blocks of consecutive frames.
+
+    Attributes:
+        scale: factor of the log odds.
+        offset: added to the scaled log odds.
+        lower_only: whether the correction may only lower the confidence, because the frames cannot show that it is too low.
+        source: ``drive`` for a recording of the rig, ``rendered`` for images that are rendered from the map.
+        measured_on: description of the frames for readers.
+        frames: number of labelled frames with confidence features, inside and outside the map.
+        right: number of frames with a right answer.
+        outside: number of out-of-map frames.
+        error_before: expected calibration error without the correction.
+        error_after: expected calibration error with corrections that were fitted on other frames.
+        accepted: number of frames in the map that are accepted at the default threshold.
+        accepted_wrong: number of accepted frames in the map with a wrong answer.
+        wrong_share_upper: upper bound (95 %, Clopper-Pearson) of the share of wrong answers among accepted answers.
+        outside_accepted: number of out-of-map frames that are accepted at the default threshold.
+        outside_share_upper: upper bound (95 %, Clopper-Pearson) of the share of accepted out-of-map frames.
+    """
+
+    scale: float = Field(ge=0.2)
+    offset: float
+    lower_only: bool
+    source: Literal["drive", "rendered"]
+    measured_on: str
+    frames: int = Field(ge=0)
+    right: int = Field(ge=0)
+    outside: int = Field(ge=0)
+    error_before: float = Field(ge=0, le=1)
+    error_after: float = Field(ge=0, le=1)
+    accepted: int = Field(ge=0)
+    accepted_wrong: int = Field(ge=0)
+    wrong_share_upper: float = Field(ge=0, le=1)
+    outside_accepted: int = Field(ge=0)
+    outside_share_upper: float = Field(ge=0, le=1)
+
+    def corrected(self, log_odds: Float64[NDArray[np.float64], "*n"]) -> Float64[NDArray[np.float64], "*n"]:
+        """Return the corrected log odds.
+
+        Args:
+            log_odds: log odds of the calibration, with the correction of the site.
+        """
+        corrected = self.scale * log_odds + self.offset
+        return np.asarray(np.minimum(corrected, log_odds) if self.lower_only else corrected)
+
+
 class Calibration(_Frozen):
     """All parameters that map confidence features to confidence and status.
 
     Attributes:
         calibrated: always true. An uncalibrated map has ``false`` in its file.
-        features: names of the confidence features. ``service.confidence.features`` defines those that this program computes.
-        right: regression of the event that the position is within 1 m.
-        known: regression of the event that the query was taken in the map, at any of its places.
+        features: the confidence features in their order. ``service.confidence.features`` defines those that this program computes.
+        right: model of the event that the position is within 1 m.
+        known: model of the event that the query was taken in the map, at any of its places.
         thresholds: sorted by rising false-accept rate.
         site: the map's own correction. None if it was not measured.
+        rig: correction for one camera rig, after that of the site. None if ``streetfix calibrate --map`` did not learn one.
         measured_on: description of the calibration data for readers.
     """
 
     calibrated: Literal[True] = True
-    features: tuple[str, ...]
-    right: Logistic
-    known: Logistic
+    features: tuple[FeatureStatistics, ...] = Field(min_length=1)
+    right: AdditiveModel
+    known: AdditiveModel
     thresholds: tuple[Threshold, ...] = Field(min_length=1)
     site: Site | None = None
+    rig: RigCorrection | None = None
     measured_on: dict[str, str | float]
 
     @model_validator(mode="after")
     def _consistent(self) -> "Calibration":
-        count = len(self.features)
-        for name, part in (("right", self.right), ("known", self.known)):
-            if (len(part.mean), len(part.spread), len(part.weights)) != (count, count, len(terms(count))):
-                raise ValueError(f"{name}: mean and spread need {count} numbers, weights {len(terms(count))}")
+        for name, model in (("right", self.right), ("known", self.known)):
+            unknown = [term.feature for term in model.terms if term.feature not in self.names]
+            if unknown:
+                raise ValueError(f"{name}: {unknown[0]} is not one of the features")
         rates = [threshold.false_accept_rate for threshold in self.thresholds]
         if rates != sorted(rates):
             raise ValueError("thresholds must be sorted by rising false-accept rate")
@@ -147,25 +195,62 @@ class Calibration(_Frozen):
         Args:
             evidence: confidence features in the order of ``features``.
         """
-        odds = self.right.log_odds(evidence)
+        odds = self.log_odds("right", evidence)
         if self.site is not None:
             odds = np.asarray(odds + self.site.offset)
-        return probability(odds)
+        return probability(odds if self.rig is None else self.rig.corrected(odds))
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The names of the confidence features in their order."""
+        return tuple(each.name for each in self.features)
+
+    def log_odds(
+        self, event: Literal["right", "known"], evidence: Float64[NDArray[np.float64], "*n F"]
+    ) -> Float64[NDArray[np.float64], "*n"]:
+        """Return the log odds of an event, without the corrections of site and rig.
+
+        Args:
+            event: ``right`` or ``known``.
+            evidence: confidence features in the order of ``features``.
+        """
+        model, columns = (self.right if event == "right" else self.known), self.names
+        odds = np.full(evidence.shape[:-1], model.bias)
+        for term in model.terms:
+            odds = odds + np.interp(evidence[..., columns.index(term.feature)], term.knots, term.log_odds)
+        return np.asarray(odds)
+
+    def deviations(self, evidence: Float64[NDArray[np.float64], "*n F"]) -> Float64[NDArray[np.float64], "*n F"]:
+        """Return the distance of each feature from its mean in the calibration data, in standard deviations.
+
+        Args:
+            evidence: confidence features in the order of ``features``.
+        """
+        mean, std = np.array([[each.mean, each.std] for each in self.features]).T
+        return np.asarray((evidence - mean) / std)
 
     @property
     def least_false_accept_rate(self) -> float:
         """The lowest false-accept rate that calibration measured."""
         return self.thresholds[0].false_accept_rate
 
-    def threshold(self, false_accept_rate: float) -> float:
-        """Return the least confidence of an accepted answer for a given false-accept rate.
+    def threshold_at(self, false_accept_rate: float) -> Threshold:
+        """Return the threshold for a given false-accept rate: that of the highest measured rate that does not exceed it.
 
         Args:
             false_accept_rate: tolerated share of accepted out-of-map queries. Below ``least_false_accept_rate`` the threshold
                 of that rate applies.
         """
-        fitting = [each.confidence for each in self.thresholds if each.false_accept_rate <= false_accept_rate]
-        return fitting[-1] if fitting else self.thresholds[0].confidence
+        fitting = [each for each in self.thresholds if each.false_accept_rate <= false_accept_rate]
+        return fitting[-1] if fitting else self.thresholds[0]
+
+    def threshold(self, false_accept_rate: float) -> float:
+        """Return the least confidence of an accepted answer for a given false-accept rate, as in ``threshold_at``.
+
+        Args:
+            false_accept_rate: tolerated share of accepted out-of-map queries.
+        """
+        return self.threshold_at(false_accept_rate).confidence
 
 
 def probability(log_odds: Float64[NDArray[np.float64], "*n"]) -> Float64[NDArray[np.float64], "*n"]:

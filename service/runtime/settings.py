@@ -146,7 +146,8 @@ class Settings(BaseSettings):
         FALSE_ACCEPT_RATE,
         ge=LEAST_FALSE_ACCEPT_RATE,
         lt=1,
-        description="largest share of out-of-map queries with status LOCALIZED",
+        description="largest share of out-of-map queries with status LOCALIZED. A higher rate than the default also accepts a "
+        "confidence below 0.9",
     )
     console: bool = Field(True, description="serve the browser console at /console, and its endpoints")
     samples: Path | None = Field(

@@ -20,7 +20,6 @@ from service.grpc.generated.streetfix.v1 import localization_pb2 as pb
 from service.grpc.generated.streetfix.v1.localization_pb2_grpc import LocalizationServiceStub
 from service.grpc.server import GrpcServer
 from service.http.app import create_app
-from service.maps.calibration import terms
 from service.maps.content import BundleContent
 from service.maps.writer import write_bundle
 from service.runtime.engine import Engine
@@ -36,14 +35,17 @@ VEHICLE = {"position": {"x": 0.0, "y": 0.0, "z": 0.5}, "orientation": {"x": -0.5
 
 def calibration(*, known: float) -> dict[str, Any]:
     """A calibration that is right in half of the cases; a rate of ``STRICT`` refuses its answers, ``LENIENT`` accepts them."""
-    count = len(FEATURES)
-    flat = {"mean": [0.0] * count, "spread": [1.0] * count, "weights": [0.0] * len(terms(count))}
+    flat: dict[str, Any] = {"terms": []}
     thresholds = ((STRICT, 0.9), (LENIENT, 0.4))
     return {
-        "calibrated": True, "features": list(FEATURES), "right": flat | {"bias": 0.0}, "known": flat | {"bias": known},
+        "calibrated": True,
+        "features": [{"name": name, "mean": 0.0, "std": 1.0} for name in FEATURES],
+        "right": flat | {"bias": 0.0},
+        "known": flat | {"bias": known},
         "thresholds": [{"false_accept_rate": rate, "confidence": confidence} for rate, confidence in thresholds],
-        "site": None, "measured_on": {"cities": "none", "queries": 0},
-    }  # fmt: skip
+        "site": None,
+        "measured_on": {"cities": "none", "queries": 0},
+    }
 
 
 @pytest.fixture(scope="module", params=["AMBIGUOUS", "OUT_OF_MAP"])
@@ -52,10 +54,13 @@ def refusing(
 ) -> Iterator[Any]:
     """Both faces over a map on the Earth that answers a strict question with the status of the parameter."""
     folder: Path = tmp_path_factory.mktemp("refusing") / "tiny"
-    write_bundle(folder, content_of(
-        calibration=calibration(known=1.0 if request.param == "AMBIGUOUS" else -1.0),
-        georeference={"latitude_deg": 48.0, "longitude_deg": 11.0, "height_m": 500.0},
-    ))  # fmt: skip
+    write_bundle(
+        folder,
+        content_of(
+            calibration=calibration(known=1.0 if request.param == "AMBIGUOUS" else -1.0),
+            georeference={"latitude_deg": 48.0, "longitude_deg": 11.0, "height_m": 500.0},
+        ),
+    )
     engine = Engine.open(Settings(maps=(folder,), threads=1, queue=16, false_accept_rate=STRICT))
     server = uvicorn.Server(uvicorn.Config(create_app(engine), port=0, log_config=None, lifespan="off"))
     thread = threading.Thread(target=server.run)
@@ -110,9 +115,11 @@ def test_rest(refusing: Any, parts_of: Parts) -> None:
     request = json.loads(parts["request"])
     batch = posted(refusing.client, "/v1/localize/batch", numbered(parts, 1, {"requests": [request]})).json()
     require_refused(batch["outcomes"][0]["answer"], refusing.status)
-    sequence = posted(refusing.client, "/v1/localize/sequence", numbered(parts, 1, {"frames": [
-        {"camera": request["camera"], "depth": request["depth"]}
-    ]}))  # fmt: skip
+    sequence = posted(
+        refusing.client,
+        "/v1/localize/sequence",
+        numbered(parts, 1, {"frames": [{"camera": request["camera"], "depth": request["depth"]}]}),
+    )
     require_refused(sequence.json(), refusing.status)
     require_refused(posted(refusing.client, "/v1/explain", parts).json()["answer"], refusing.status)
 
@@ -130,9 +137,12 @@ def test_the_same_question_less_strict_has_its_pose(refusing: Any, parts_of: Par
 def test_grpc(refusing: Any, parts_of: Parts) -> None:
     parts, AHEAD = parts_of(), pb.RigidTransform(**VEHICLE)
     request = pb.LocalizeRequest(
-        rgb=parts["rgb"], depth=parts["depth"], camera=CAMERA, depth_format=pb.DepthFormat(scale_m=1),
+        rgb=parts["rgb"],
+        depth=parts["depth"],
+        camera=CAMERA,
+        depth_format=pb.DepthFormat(scale_m=1),
         vehicle_from_camera=AHEAD,
-    )  # fmt: skip
+    )
     frame = pb.SequenceFrame(rgb=request.rgb, depth=request.depth, camera=CAMERA, depth_format=request.depth_format)
     stub: LocalizationServiceStub = refusing.stub
     answers = [
@@ -155,9 +165,11 @@ def test_both_faces_and_clients_give_the_same_reasons(refusing: Any, parts_of: P
     response = posted(refusing.client, "/v1/localize", parts)
     json.loads(response.text, parse_constant=pytest.fail)
     reasons = response.json()["reasons"]
-    message = refusing.stub.Localize(pb.LocalizeRequest(
-        rgb=parts["rgb"], depth=parts["depth"], camera=CAMERA, depth_format=pb.DepthFormat(scale_m=1)
-    ))  # fmt: skip
+    message = refusing.stub.Localize(
+        pb.LocalizeRequest(
+            rgb=parts["rgb"], depth=parts["depth"], camera=CAMERA, depth_format=pb.DepthFormat(scale_m=1)
+        )
+    )
     assert [(each.check, dict(each.evidence), each.remedy) for each in message.reasons] == [
         (each["check"], each["evidence"], each["remedy"]) for each in reasons
     ]

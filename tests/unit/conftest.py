@@ -1,4 +1,4 @@
-"""What several packages' tests stand on: a simulated drive and its map, made once and only where a test asks for them; factories."""
+"""Shared fixtures: a simulated drive and its map, made once and on demand, and factories."""
 
 import json
 from collections.abc import Callable
@@ -16,7 +16,7 @@ from service.geometry.camera import PinholeCamera
 from service.geometry.rigid import R_BODY_OPTICAL, rotation_z, transform_from, transform_points
 from service.imaging.query_view import QueryViews
 from service.imaging.view_grid import ViewGrid
-from service.maps.calibration import Calibration, terms
+from service.maps.calibration import Calibration
 from service.maps.content import BundleContent
 from service.maps.reader import MapBundle
 from service.maps.writer import write_bundle
@@ -45,13 +45,17 @@ BERLIN = {"latitude_deg": 52.52, "longitude_deg": 13.405, "height_m": 70.0}
 
 
 def matches_of(xyz: Any, heading_deg: Any, similarity: Any, *, R_map_place: Any = None) -> ViewMatches:
-    """One view for each place."""
+    """Return one view for each place."""
     n, R = len(xyz), np.eye(3) if R_map_place is None else R_map_place
     poses = [transform_from(R, np.array(each, np.float64)) for each in xyz]
     return ViewMatches(
-        np.arange(n), np.array(similarity, np.float64), np.arange(n, dtype=np.int32), np.zeros(n, np.int32),
-        np.deg2rad(np.array(heading_deg, np.float64)), np.stack(poses),
-    )  # fmt: skip
+        np.arange(n),
+        np.array(similarity, np.float64),
+        np.arange(n, dtype=np.int32),
+        np.zeros(n, np.int32),
+        np.deg2rad(np.array(heading_deg, np.float64)),
+        np.stack(poses),
+    )
 
 
 def frame_of(
@@ -65,7 +69,7 @@ def frame_of(
     descriptors: Any = ((1.0, 0.0),),
     noise: float = 1e-4,
 ) -> Frame:
-    """A picture pair that was looked up with these matches; the pictures themselves are black and empty unless given."""
+    """Return an image pair with these retrieval matches. The images are black and empty unless given."""
     camera = camera or PinholeCamera(6, 4, 3.0, 3.0, 2.5, 1.5)
     depth_m = np.zeros((camera.height, camera.width), np.float32) if depth_m is None else depth_m
     query = Query(rgb=np.zeros((*depth_m.shape, 3), np.uint8), depth_m=depth_m, camera=camera)
@@ -77,14 +81,18 @@ def frame_of(
 
 
 def calibration_document(**changed: Any) -> dict[str, Any]:
-    """A good ``calibration.json``: whatever the evidence, it is right at even odds and in the map three times in four."""
-    count = len(FEATURES)
-    flat = {"mean": [0.0] * count, "spread": [1.0] * count, "weights": [0.0] * len(terms(count))}
+    """Return a valid ``calibration.json``: for all features, 0.5 for a right pose and 0.75 for a place in the map."""
+    flat: dict[str, Any] = {"terms": []}
     document = {
-        "calibrated": True, "features": list(FEATURES), "right": flat | {"bias": 0.0}, "known": flat | {"bias": float(np.log(3.0))},
+        "calibrated": True,
+        "features": [{"name": name, "mean": 0.0, "std": 1.0} for name in FEATURES],
+        "right": flat | {"bias": 0.0},
+        "known": flat | {"bias": float(np.log(3.0))},
         "thresholds": [{"false_accept_rate": 0.001, "confidence": 0.9}, {"false_accept_rate": 0.01, "confidence": 0.4}],
-        "site": None, "measured_on": {"cities": "none", "queries": 0},
-    }  # fmt: skip
+        "site": None,
+        "rig": None,
+        "measured_on": {"cities": "none", "queries": 0},
+    }
     return document | changed
 
 
@@ -109,7 +117,7 @@ def calibration_of() -> Callable[..., Calibration]:
 
 
 def refused_answer(answer: dict[str, Any], status: str = "AMBIGUOUS", **changed: Any) -> dict[str, Any]:
-    """A LOCALIZED answer of the contract as it would be if it were not: its pose is one of two hypotheses, 60 m apart."""
+    """Return a LOCALIZED answer of the contract, changed to a refused one: its pose is one of two hypotheses, 60 m apart."""
     guess = answer["pose"]
     elsewhere = guess | {"position": guess["position"] | {"y": guess["position"]["y"] + 60.0}}
     hypotheses = [
@@ -117,9 +125,11 @@ def refused_answer(answer: dict[str, Any], status: str = "AMBIGUOUS", **changed:
         for each in (guess, elsewhere)
     ]
     spread = {
-        "mean": guess["position"] | {"y": guess["position"]["y"] + 30.0}, "covariance": [1.0, 0, 0, 0, 900.0, 0, 0, 0, 1.0],
-        "heading_std_deg": 20.0, "hypotheses_weight": 0.75,
-    }  # fmt: skip
+        "mean": guess["position"] | {"y": guess["position"]["y"] + 30.0},
+        "covariance": [1.0, 0, 0, 0, 900.0, 0, 0, 0, 1.0],
+        "heading_std_deg": 20.0,
+        "hypotheses_weight": 0.75,
+    }
     reasons = [{"check": "baseline", "evidence": {"log_noise": 4.0, "points": -3.5}, "remedy": "check the baseline"}]
     gone = {"pose": None, "vehicle_pose": None, "geopose": None, "street": None}
     return answer | gone | {"status": status, "hypotheses": hypotheses, "spread": spread, "reasons": reasons} | changed
@@ -134,17 +144,20 @@ def refused_of() -> Callable[..., dict[str, Any]]:
 def bundle_at(
     content_of: Callable[..., BundleContent], tmp_path_factory: pytest.TempPathFactory
 ) -> Callable[..., MapBundle]:
-    """A map of places at some positions, with the same headings (degrees) at each; a row of descriptors a view."""
+    """Return a map of places at given positions, with the same headings (degrees) at each; one descriptor per view."""
 
     def bundle(xyz: Any, heading_deg: Any, descriptors: Any, **changed: Any) -> MapBundle:
         places, headings = len(xyz), np.deg2rad(np.array(heading_deg, np.float64))
         content = content_of(
             T_map_place=np.stack([transform_from(np.eye(3), np.array(each, np.float64)) for each in xyz]),
-            place_street=np.full(places, -1, np.int32), streets=None, headings=len(headings),
+            place_street=np.full(places, -1, np.int32),
+            streets=None,
+            headings=len(headings),
             view_place=np.repeat(np.arange(places, dtype=np.int32), len(headings)),
-            view_heading_rad=np.tile(headings, places), descriptors=np.array(descriptors, np.float32),
+            view_heading_rad=np.tile(headings, places),
+            descriptors=np.array(descriptors, np.float32),
             **{"cloud": None} | changed,
-        )  # fmt: skip
+        )
         folder = tmp_path_factory.mktemp("bundles") / "m"
         write_bundle(folder, content)
         return MapBundle.open(folder)
@@ -153,7 +166,7 @@ def bundle_at(
 
 
 def answers_with(true_xy: Any, answer_xy: Any, **changed: Any) -> Any:
-    """Predictions of queries taken and answered at positions on the ground; NaN for no answer; accepted unless told."""
+    """Return predictions for queries at ground positions. NaN means no answer. Answers are accepted by default."""
     from model_training.evaluation.predict import RANKED, Predictions
 
     true_xy, answer_xy = np.array(true_xy, np.float64), np.array(answer_xy, np.float64)
@@ -180,7 +193,7 @@ def answers_of() -> Callable[..., Any]:
 
 @pytest.fixture(scope="session")
 def saved_run(small_map: Path, small_dataset: Any, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The report folder of ``small_map`` asked the queries of ``small_dataset``, as ``evaluate --report`` leaves it."""
+    """Return the report folder that ``evaluate --report`` writes for ``small_map`` and the queries of ``small_dataset``."""
     from model_training.evaluation.evaluate import evaluate
     from model_training.evaluation.saved_run import save_run
     from model_training.reporting.run_page import write_run_page
@@ -193,7 +206,7 @@ def saved_run(small_map: Path, small_dataset: Any, tmp_path_factory: pytest.Temp
 
 @pytest.fixture(scope="session")
 def small_dataset(tmp_path_factory: pytest.TempPathFactory) -> Any:
-    """A dozen scans of a LiDAR that looks down (2 to -24.8 degrees) and five picture pairs of another drive."""
+    """Return a dozen scans of a LiDAR that looks down (2 to -24.8 degrees) and five image pairs of another drive."""
     from model_training.datasets.dataset import Dataset
     from model_training.simulation.plan import CameraPlan, QueryPlan, SimulationPlan
     from model_training.simulation.sensor_parameters import LidarParameters
@@ -201,17 +214,23 @@ def small_dataset(tmp_path_factory: pytest.TempPathFactory) -> Any:
 
     out = tmp_path_factory.mktemp("datasets") / "small"
     plan = SimulationPlan(
-        name="small", seed=3, size_m=(60.0, 60.0), spacing_m=5.0, streets=("1",), lidar="hdl_64",
+        name="small",
+        seed=3,
+        size_m=(60.0, 60.0),
+        spacing_m=5.0,
+        streets=("1",),
+        lidar="hdl_64",
         lidar_parameters=LidarParameters(bottom_deg=-24.8),  # evenly spaced beams
-        camera=CameraPlan(width=96, height=72), queries=(QueryPlan(name="drive1", traversal=1, count=5),),
-    )  # fmt: skip
+        camera=CameraPlan(width=96, height=72),
+        queries=(QueryPlan(name="drive1", traversal=1, count=5),),
+    )
     simulate(plan, out, workers=1)
     return Dataset(out)
 
 
 @pytest.fixture(scope="session")
 def encoder_file(encoder_of: Any, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A random projection, for views of 8 x 16 cells."""
+    """Return a random projection for views of 8 x 16 cells."""
     path: Path = tmp_path_factory.mktemp("encoders") / "encoder.onnx"
     path.write_bytes(encoder_of())
     return path
@@ -219,21 +238,21 @@ def encoder_file(encoder_of: Any, tmp_path_factory: pytest.TempPathFactory) -> P
 
 @pytest.fixture(scope="session")
 def small_map(small_dataset: Any, encoder_file: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The bundle of ``small_dataset``, six headings a place."""
+    """Return the bundle of ``small_dataset`` with six headings per place."""
     from model_training.mapping.build import build_map
     from model_training.mapping.settings import BuildSettings
 
     out: Path = tmp_path_factory.mktemp("maps") / "small"
     settings = BuildSettings(
         name="small", headings=6, spacing_m=5.0, between_m=0.0, calibration=None, align_survey=False, traffic_vote=False
-    )  # fmt: skip
+    )
     build_map(small_dataset, encoder_file, out, settings, threads=1)
     return out
 
 
 @pytest.fixture(scope="session")
 def calibration_file_of(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., Path]:
-    """A calibration file that says whose answers it was measured on."""
+    """Return a calibration file that names the encoder it was measured on."""
 
     def made(encoder_sha256: str, **changed: Any) -> Path:
         path = tmp_path_factory.mktemp("calibrations") / "calibration.json"
@@ -245,7 +264,7 @@ def calibration_file_of(tmp_path_factory: pytest.TempPathFactory) -> Callable[..
 
 @pytest.fixture(scope="session")
 def stock_map(small_dataset: Any, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """``small_map`` by the stock encoder, with its calibration."""
+    """Return ``small_map`` built with the stock encoder, with its calibration."""
     from model_training.mapping.build import build_map
     from model_training.mapping.settings import BuildSettings
     from model_training.stock import CALIBRATION, ENCODER
@@ -262,8 +281,9 @@ def stock_map(small_dataset: Any, tmp_path_factory: pytest.TempPathFactory) -> P
 def streets_alike(
     content_of: Callable[..., BundleContent], pictures_of: Callable[..., Any], tmp_path_factory: pytest.TempPathFactory
 ) -> Callable[..., Path]:
-    """A bundle of two streets that retrieval cannot tell apart, each measured as the camera saw it from (20, 0) or (20, 90), looking
-    north; the walls of the first are those of the picture of another seed. The map's origin lies in Berlin."""
+    """Return a bundle of two streets with equal descriptors. Both were measured from (20, 0) or (20, 90), looking north.
+    The walls of the first street are those of an image with another seed. The map origin is in Berlin.
+    """
 
     def made(*, seed_of_first: int = 3) -> Path:
         voxels = VoxelMap(0.3, np.array([20.0, 0.0, 2.0]))
@@ -274,9 +294,12 @@ def streets_alike(
             for _ in range(3):  # so that every voxel has points enough for a normal
                 voxels.add(transform_points(T_map_camera, points_camera))
         content = content_of(
-            name="alike", streets=None, place_street=np.full(12, -1, np.int32), georeference=BERLIN,
+            name="alike",
+            streets=None,
+            place_street=np.full(12, -1, np.int32),
+            georeference=BERLIN,
             cloud=SurfelMap.prepare(voxels.origin, *voxels.tiles(voxels.surfels())),
-        )  # fmt: skip
+        )
         content.T_map_place[6:, 1, 3] = 90.0
         content.descriptors[:24] = content.descriptors[24:]
         folder = tmp_path_factory.mktemp("maps") / "alike"
@@ -288,7 +311,7 @@ def streets_alike(
 
 @pytest.fixture(scope="session")
 def twin_map(streets_alike: Callable[..., Path]) -> Path:
-    """Two streets that nothing tells apart."""
+    """Return a map of two identical streets."""
     return streets_alike()
 
 
@@ -297,7 +320,7 @@ _VOID = {"meta", "img", "br", "link", "input", "hr"}
 
 
 class Page(HTMLParser):
-    """Elements with their attributes, and whether all are closed."""
+    """Parses elements with their attributes, and checks that all are closed."""
 
     def __init__(self, document: str) -> None:
         super().__init__()

@@ -8,6 +8,7 @@ from model_training.calibration import collect
 from model_training.calibration.collect import asked_of, in_the_map, of_another_city, preset_of, walls_and_rooms
 from model_training.calibration.rigs import RIGS
 from model_training.evaluation.predict import RANKED, Predictions
+from model_training.simulation.depth_noise import DEPTHS
 from service.confidence.features import FEATURES
 from service.errors import NoDepthError
 from service.geometry.camera import PinholeCamera
@@ -35,10 +36,21 @@ def test_an_answer_within_a_metre_on_the_ground_is_right():
     np.testing.assert_array_equal(found.evidence, predictions([0.0] * 5).evidence)
 
 
+def test_calibration_data_hold_the_error_and_the_heading_of_a_known_query():
+    """0.6 of the error is along x, 0.8 along y. The optical axis of an identity pose points up, so its heading is any finite number."""
+    found = asked_of(predictions([0.5, np.nan], up_m=3.0), "drive1_sgbm", known=True)
+    np.testing.assert_allclose(found.error[0], [0.3, 0.4, 3.0, 0, 0, 0], atol=1e-12)
+    assert np.isnan(found.error[1, :2]).all()
+    assert np.isfinite(found.heading_rad).all()
+    assert found.family.tolist() == ["sgbm", "sgbm"]
+
+
 def test_outside_the_map_no_answer_is_right():
     found = asked_of(predictions([0.0, 50.0]), "other_city.precise", known=False)
     assert not found.right.any()
     assert not found.known.any()
+    assert np.isnan(found.error).all()
+    assert np.isnan(found.heading_rad).all()
 
 
 @pytest.mark.parametrize(
@@ -55,6 +67,8 @@ class City:
         return ["clear_precise", "clear_stereo", "rain_precise"] + ["untold_stereo"] * (not with_truth)
 
 
+#: Depth cameras of walls and rooms.
+MODELS = (DEPTHS["precise"], DEPTHS["stereo"])
 #: Stand-ins that ``collect`` only passes on.
 LOCALIZER: Any = "localizer"
 CITY: Any = City()
@@ -131,7 +145,7 @@ def wherever() -> Any:
 def test_walls_and_rooms_are_nowhere_and_told_by_kind_and_preset():
     localizer, told = wherever(), []
     camera = PinholeCamera(32, 24, 16.0, 16.0, 15.5, 11.5)
-    found = walls_and_rooms(localizer, camera, 3, lambda *told_of: told.append(told_of), count=4)
+    found = walls_and_rooms(localizer, camera, 3, lambda *told_of: told.append(told_of), MODELS, count=4)
     assert [set(each.kind.tolist()) for each in found] == [
         {"wall.precise"}, {"wall.stereo"}, {"room.precise"}, {"room.stereo"},
     ]  # fmt: skip
@@ -146,8 +160,8 @@ def test_walls_and_rooms_are_nowhere_and_told_by_kind_and_preset():
 def test_another_rig_sees_the_same_walls_and_rooms():
     whole, cut = wherever(), wherever()
     camera = PinholeCamera(32, 24, 16.0, 16.0, 15.5, 11.5)
-    walls_and_rooms(whole, camera, 3, lambda *_: None, count=2)
-    found = walls_and_rooms(cut, camera, 3, lambda *_: None, count=2, rig=RIGS[0])
+    walls_and_rooms(whole, camera, 3, lambda *_: None, MODELS, count=2)
+    found = walls_and_rooms(cut, camera, 3, lambda *_: None, MODELS, count=2, rig=RIGS[0])
     assert [set(each.kind.tolist()) for each in found] == [
         {"narrow_wall.precise"}, {"narrow_wall.stereo"}, {"narrow_room.precise"}, {"narrow_room.stereo"},
     ]  # fmt: skip
@@ -158,7 +172,9 @@ def test_another_rig_sees_the_same_walls_and_rooms():
 def test_every_city_draws_walls_and_rooms_of_its_own():
     def first(seed):
         localizer = wherever()
-        walls_and_rooms(localizer, PinholeCamera(32, 24, 16.0, 16.0, 15.5, 11.5), seed, lambda *_: None, count=1)
+        walls_and_rooms(
+            localizer, PinholeCamera(32, 24, 16.0, 16.0, 15.5, 11.5), seed, lambda *_: None, MODELS, count=1
+        )
         return np.concatenate([query.depth_m for query in localizer.asked])
 
     np.testing.assert_array_equal(first(1), first(1))

@@ -1,4 +1,3 @@
-import re
 from types import SimpleNamespace
 from typing import Any
 
@@ -8,9 +7,8 @@ import pytest
 pytest.importorskip("torch", reason="needs the extra `training`")
 
 from model_training.calibration import make  # after the skip
-from model_training.calibration.fit import Asked, fit, pooled
-from model_training.calibration.make import confidences, cross_checks
-from model_training.calibration.plans import PAIR_RIGS
+from model_training.calibration.families import FAMILIES
+from model_training.calibration.fit import Asked, pooled
 from service.confidence.features import FEATURES
 
 COUNT, MARGIN = len(FEATURES), FEATURES.index("margin")
@@ -28,43 +26,11 @@ def city(seed, *, upside_down=False, count=1200):
         evidence[:, MARGIN] *= -1
     presets = np.where(rng.random(count) < 0.5, "precise", "stereo")
     names = np.array(["clear_", "other_city.", "removed_streets.", "wall.", "room."])[sort]
-    return Asked(evidence, right, known, np.char.add(names, presets))
-
-
-def test_confidence_is_the_calibrations_and_nothing_where_nothing_was_registered():
-    asked = city(1)
-    calibration = fit(asked, measured_on={})
-    asked.evidence[5] = np.nan
-    found = confidences(calibration, asked)
-    assert found[5] == 0
-    rest = np.arange(len(asked)) != 5
-    np.testing.assert_allclose(found[rest], calibration.confidence(asked.evidence[rest]))
-
-
-def test_every_city_is_predicted_from_the_others_with_both_presets():
-    lines = cross_checks([city(seed, count=4000) for seed in (1, 2, 3)], city(4))
-    assert len(lines) == 9
-    for index in range(3):
-        head, *presets = lines[3 * index : 3 * index + 3]
-        error = re.fullmatch(rf"city {index + 1} from the others: expected calibration error (0\.\d{{4}})", head)
-        assert error is not None
-        assert float(error[1]) < 0.1
-        for preset, line in zip(("precise", "stereo"), presets, strict=True):
-            shares = re.fullmatch(
-                rf"  {preset}: false accepts at 95 % of the true ones: "
-                r"other_city (0\.\d{4}), removed_streets (0\.\d{4}), wall (0\.\d{4}), room (0\.\d{4})",
-                line,
-            )
-            assert shares is not None
-            assert max(map(float, shares.groups())) < 0.05
-
-
-def test_a_city_is_not_predicted_from_itself():
-    """The second contradicts the first: each is predicted as wrongly as can be, however well it fits itself."""
-    one, other = city(1), city(2, upside_down=True)
-    heads = [line for line in cross_checks([one, other], city(3, count=10)) if line.startswith("city")]
-    assert min(float(line.rsplit(" ", 1)[1]) for line in heads) > 0.3
-    assert len(pooled([one, other])) == 2400
+    return Asked(
+        evidence=evidence, right=right, known=known, kind=np.char.add(names, presets), family=np.full(len(evidence), "any"),
+        error=np.full((len(evidence), 6), np.nan), covariance=np.full((len(evidence), 6, 6), np.nan),
+        heading_rad=np.full(len(evidence), np.nan),
+    )  # fmt: skip
 
 
 def _dataset(name, folder):
@@ -114,8 +80,10 @@ class Work:
         self.asked.append(("where_streets_are_missing", localizer, dataset.name, tuple(names)))
         return [city(len(self.asked), count=10)]
 
-    def walls_and_rooms(self, localizer, camera, seed, report, *, rig=None):
+    def walls_and_rooms(self, localizer, camera, seed, report, models, *, count=100, rig=None):
         assert (camera, report) == ("camera", print)
+        assert {model.name for model in models} <= {"precise", "stereo"}
+        assert count in (40, 100)
         self.asked.append(("walls_and_rooms", localizer, seed, *_name_of(rig)))
         return [city(len(self.asked), count=10)]
 
@@ -131,8 +99,8 @@ def work(monkeypatch, tmp_path, encoder_file):
 CLEAR = ("clear_precise", "clear_stereo")
 
 
-def test_a_city_is_asked_of_its_own_map_the_next_ones_sparse_ones_of_both_and_where_streets_are_missing(work):
-    """Who comes to a sparse survey looks less like its places, whether he is a stranger or not; so does a rig that sees less."""
+def test_the_queries_of_a_city_are_localized_in_its_own_map_the_other_one_and_without_some_streets(work):
+    """A rig that sees less localizes the same queries in both maps."""
     found = work.all_of(1)
     assert work.asked == [
         ("in_the_map", "two", "two", ()),
@@ -141,20 +109,12 @@ def test_a_city_is_asked_of_its_own_map_the_next_ones_sparse_ones_of_both_and_wh
         ("in_the_map", "two", "two", CLEAR, "narrow"),
         ("walls_and_rooms", "two", 1, "narrow"),
         ("of_another_city", "three", "two", CLEAR, "narrow"),
-        ("in_the_map", "two-sparse", "two", CLEAR),
-        ("of_another_city", "three-sparse", "two", CLEAR),
         ("where_streets_are_missing", "two-without-streets", "two", CLEAR),
     ]
-    np.testing.assert_array_equal(found.evidence, pooled([city(k, count=10) for k in range(1, 10)]).evidence)
-
-
-def test_a_sparse_map_has_a_place_every_five_metres_and_any_other_every_metre(work):
-    work.all_of(1)
+    np.testing.assert_array_equal(found.evidence, pooled([city(k, count=10) for k in range(1, 8)]).evidence)
     assert work.built == [
         ("two", False, "two", 1.0),
         ("three", False, "three", 1.0),
-        ("two", False, "two-sparse", 5.0),
-        ("three", False, "three-sparse", 5.0),
         ("two", True, "two-without-streets", 1.0),
     ]
 
@@ -168,11 +128,11 @@ def test_repeating_blocks_are_asked_of_their_own_map_and_kept(work):
     np.testing.assert_array_equal(first.evidence, again.evidence)
 
 
-def test_a_stereo_rig_asks_its_own_cities_and_the_other_of_them(work, monkeypatch):
+def test_a_family_localizes_the_queries_of_its_cities_in_both_maps(work, monkeypatch):
     monkeypatch.setattr(make, "simulate", lambda *_, **__: None)
     monkeypatch.setattr(make, "Dataset", lambda folder: _dataset(folder.name, folder.parent))
-    car = PAIR_RIGS[0]
-    found = make._asked_pairs(work.folder, work.encoder, car, anew=False, report=print)
+    car = FAMILIES[0]
+    found = make._asked_family(work.folder, work.encoder, car, anew=False, report=print)
     one, two = "calibration-car-1", "calibration-car-2"
     assert work.asked == [
         ("in_the_map", one, one, (), "car"),
@@ -182,16 +142,17 @@ def test_a_stereo_rig_asks_its_own_cities_and_the_other_of_them(work, monkeypatc
         ("walls_and_rooms", two, 0, "car"),
     ]
     assert len(found) == 50
+    assert set(found.family.tolist()) == {"car"}
     assert {name for name, *_ in work.built} == {one, two}
 
 
 def test_the_last_city_is_asked_of_the_first_ones_maps(work):
     work.all_of(2)
-    assert [row[1] for row in work.asked if row[0] == "of_another_city"] == ["one", "one", "one-sparse"]
+    assert [row[1] for row in work.asked if row[0] == "of_another_city"] == ["one", "one"]
 
 
 def test_maps_and_answers_are_kept_and_questions_asked_anew_only_on_demand(work):
-    """Each city's sparse map serves the city before it, too."""
+    """The map of each city serves the queries of another city too."""
     first = work.all_of(1)
     count = len(work.asked)
     again = work.all_of(1)
@@ -200,6 +161,6 @@ def test_maps_and_answers_are_kept_and_questions_asked_anew_only_on_demand(work)
     assert again.kind.tolist() == first.kind.tolist()
     work.all_of(1, anew=True)
     assert len(work.asked) == 2 * count
-    assert len(work.built) == 5
+    assert len(work.built) == 3
     work.all_of(2)
-    assert [row[2] for row in work.built[5:]] == ["one", "one-sparse", "three-without-streets"]
+    assert [row[2] for row in work.built[3:]] == ["one", "three-without-streets"]

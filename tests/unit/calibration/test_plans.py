@@ -2,13 +2,11 @@ import pytest
 
 pytest.importorskip("torch", reason="needs the extra `training`")
 
-from model_training.calibration.plans import (  # after the skip
+from model_training.calibration.families import FAMILIES, FAMILY_CITIES, family_plan  # after the skip
+from model_training.calibration.plans import (
     CITIES,
-    PAIR_CITIES,
-    PAIR_RIGS,
     SEQUENCE,
     calibration_plan,
-    pair_plan,
     repeating_plan,
 )
 from model_training.simulation.hard import HARD
@@ -17,7 +15,7 @@ from model_training.training.recipe import CALIBRATION_SEEDS
 
 def test_calibration_cities_have_seeds_of_their_own_among_those_kept_for_them():
     seeds = [calibration_plan(index).seed for index in range(CITIES)] + [repeating_plan().seed]
-    seeds += [pair_plan(rig, index).seed for rig in PAIR_RIGS for index in range(PAIR_CITIES)]
+    seeds += [family_plan(family, index).seed for family in FAMILIES for index in range(FAMILY_CITIES)]
     assert set(seeds) <= set(CALIBRATION_SEEDS)
     assert len(set(seeds)) == len(seeds) > 1
 
@@ -38,15 +36,3 @@ def test_the_last_city_and_the_repeating_blocks_are_asked_in_sequences_too(plan)
     assert (last.name, last.count, last.sequence, last.depths) == ("sequences", 4, SEQUENCE, ("precise", "stereo"))
     assert last.traversal not in {query.traversal for query in plan.queries[:-1]}
     assert all(query.sequence is None for query in plan.queries[:-1])
-
-
-@pytest.mark.parametrize("rig", PAIR_RIGS, ids=lambda rig: rig.name)
-def test_a_rig_is_rectified_anew_for_each_drive_and_its_last_city_has_sequences(rig):
-    plans = [pair_plan(rig, index).checked() for index in range(PAIR_CITIES)]
-    for plan in plans:
-        drives = [query.traversal for query in plan.queries]
-        assert len(set(drives)) == len(drives)
-        assert 0 not in drives  # the survey's own
-        assert plan.focal_baseline_px_m() == rig.stereo.focal_baseline_px_m
-    assert [plan.queries[-1].sequence for plan in plans] == [None, SEQUENCE]
-    assert len({plan.name for plan in plans}) == PAIR_CITIES

@@ -44,3 +44,13 @@ def test_a_stereo_rig_says_its_baseline(query: Query) -> None:
 def test_a_window_beyond_the_picture_is_refused(width: float, height: float) -> None:
     with pytest.raises(ValueError, match="rig odd"):
         Rig("odd", width, height, stereo=False)
+
+
+def test_a_spinning_lidar_measures_on_its_beams_only(query: Query) -> None:
+    """The horizon of this camera lies between rows 23 and 24. A beam 45 degrees up is out of its view."""
+    seen = Rig("rings", beams_deg=(0.0, 45.0)).seen(query)
+    rows = np.flatnonzero((seen.depth_m > 0).any(axis=1))
+    assert set(rows) <= {23, 24}
+    assert len(rows) > 0
+    np.testing.assert_array_equal(seen.depth_m[rows], query.depth_m[rows])
+    np.testing.assert_array_equal(seen.rgb, query.rgb)

@@ -5,7 +5,6 @@ from hypothesis import strategies as st
 
 from service.confidence.decision import decide
 from service.confidence.features import FEATURES
-from service.maps.calibration import terms
 
 
 def odds(p):
@@ -14,13 +13,13 @@ def odds(p):
 
 @pytest.fixture(scope="module")
 def decided(calibration_json, calibration_of):
-    """What is made of a first feature whose size is the log odds of being right, and of whether the place is known."""
+    """Decide with one feature, whose value is the log odds of a right answer, and with log odds of a known place."""
 
     def made(right, known=0.5, rate=0.01, *, share=1.0, prior_nats=0.0, **changed):
-        first = np.eye(1, len(terms(len(FEATURES))))[0].tolist()
+        first = {"feature": FEATURES[0], "knots": [-20.0, 20.0], "log_odds": [-20.0, 20.0]}
         good = calibration_json()
         calibration = calibration_of(
-            right=good["right"] | {"weights": first}, known=good["known"] | {"bias": odds(known)}, **changed
+            right=good["right"] | {"terms": [first]}, known=good["known"] | {"bias": odds(known)}, **changed
         )
         evidence = np.zeros(len(FEATURES))
         evidence[0], evidence[FEATURES.index("log_share")] = odds(right), np.log(share)
@@ -51,7 +50,7 @@ def test_the_status_follows_from_the_confidence_and_whether_the_place_is_in_the_
     assert isinstance(found.confidence, float)
 
 
-def test_who_is_exactly_as_sure_as_asked_is_accepted_and_as_probably_known_as_not_is_ambiguous(decided):
+def test_confidence_at_the_threshold_is_accepted_and_equal_odds_of_the_place_are_ambiguous(decided):
     accepted = decided(0.5, thresholds=[{"false_accept_rate": 0.01, "confidence": 0.5}])
     refused = decided(0.5, 0.5, thresholds=[{"false_accept_rate": 0.01, "confidence": 0.51}])
     assert (accepted.status, refused.status) == ("LOCALIZED", "AMBIGUOUS")
@@ -75,7 +74,7 @@ rate = st.floats(1e-6, 0.999)
 
 
 @given(st.floats(0.02, 0.98), st.floats(0.02, 0.98), rate, rate)
-def test_who_can_live_with_more_false_accepts_is_refused_no_answer_that_another_gets(decided, right, known, one, other):
+def test_a_larger_false_accept_rate_never_refuses_more(decided, right, known, one, other):
     strict, lax = decided(right, known, min(one, other)), decided(right, known, max(one, other))
     assert strict.confidence == lax.confidence
     assert lax.status == "LOCALIZED" or strict.status == lax.status
@@ -91,9 +90,7 @@ def test_who_can_live_with_more_false_accepts_is_refused_no_answer_that_another_
         (1 / 6, 0.1, "OUT_OF_MAP"),
     ],
 )
-def test_who_holds_no_more_than_half_of_the_support_of_all_places_is_not_accepted_however_sure(
-    decided, share, known, status
-):
+def test_a_candidate_with_at_most_half_of_the_support_is_not_accepted_at_any_confidence(decided, share, known, status):
     found = decided(0.95, known, share=share)
     assert found.status == status
     assert found.confidence == pytest.approx(0.95)
@@ -115,7 +112,7 @@ def test_a_prior_changes_the_odds_of_being_in_the_map_by_bayes_rule(decided, rig
     assert decided(right, known, prior_nats=nats).confidence == pytest.approx(confidence, rel=1e-4)
 
 
-def test_a_prior_makes_a_doubted_answer_an_accepted_one_and_a_stranger_an_ambiguous_one(decided):
+def test_a_prior_turns_an_uncertain_answer_into_an_accepted_one_and_out_of_map_into_ambiguous(decided):
     assert decided(0.2, 0.25).status == "OUT_OF_MAP"
     assert decided(0.2, 0.25, prior_nats=5.0).status == "LOCALIZED"
     assert decided(0.02, 0.25, prior_nats=5.0).status == "AMBIGUOUS"

@@ -17,9 +17,8 @@ from service.scoring.candidates import Refined
 
 
 def refined(*candidates, covariance=None, points=1500, disagreement=1.0):
-    return Refined(
-        candidates, np.eye(6) if covariance is None else covariance, points, disagreement, lambda _: np.eye(6)
-    )
+    own = np.eye(6) if covariance is None else covariance
+    return Refined(candidates, own + np.eye(6), own, points, disagreement, lambda _: np.eye(6))
 
 
 def neighbour(x, similarity=0.5, *, y=0.0, z=0.0):
@@ -37,15 +36,19 @@ def frame(frame_with, matches_at):
 
 @pytest.fixture(scope="module")
 def weighed(candidate, frame):
-    """The evidence by name; whatever a test does not say is one candidate, one neighbour, one hypothesis, one frame."""
+    """Return the features by name. Defaults: one candidate, one neighbour, one hypothesis, one frame."""
 
     def weigh(*, candidates=None, neighbours=None, weights=(1.0,), frames=None, places=None, **options):
         neighbours = neighbours or [neighbour(0)]
         there = np.array(places or [each.position_m[:2] for each in neighbours], np.float64)
         found = evidence_of(
-            frames or (frame,), refined(*(candidates or [candidate()]), **options), tuple(neighbours),
-            tuple(hypothesis(weight) for weight in weights), there, ViewGrid(),
-        )  # fmt: skip
+            frames or (frame,),
+            refined(*(candidates or [candidate()]), **options),
+            tuple(neighbours),
+            tuple(hypothesis(weight) for weight in weights),
+            there,
+            ViewGrid(),
+        )
         assert found.shape == (len(FEATURES),)
         return dict(zip(FEATURES, found.tolist(), strict=True))
 
@@ -54,18 +57,26 @@ def weighed(candidate, frame):
 
 @pytest.mark.parametrize(
     ("name", "expected"),
-    [("inliers", 0.7), ("similarity", 0.8), ("likelihood", -1.5), ("through", 0.02), ("front", 0.2), ("unmapped", 0.1),
+    [("inliers", 0.7), ("similarity", 0.8), ("likelihood", -1.5), ("through", 0.02 / 0.9), ("front", 0.2 / 0.9), ("unmapped", 0.1),
+     ("mapped_inliers", 0.7 / 0.9),
      ("measured", 0.75), ("place_m", 1.5)],
 )  # fmt: skip
-def test_what_is_known_of_the_best_candidate_is_told_as_it_is(candidate, weighed, name, expected):
+def test_features_of_the_best_candidate_are_unchanged(candidate, weighed, name, expected):
     worse = {"similarity": 0.1, "place_m": 7.0, "likelihood": -9.0, "through": 0.9, "front": 0.9, "unmapped": 0.9}
     other = replace(candidate(-1.0, xyz=(50, 0, 1.5)), scores=worse)
-    assert weighed(candidates=(candidate(), other))[name] == expected
+    assert weighed(candidates=(candidate(), other))[name] == pytest.approx(expected)
+
+
+def test_shares_of_mapped_points_stay_finite_where_the_map_shows_nothing(candidate, weighed):
+    best = candidate()
+    found = weighed(candidates=(replace(best, scores={**best.scores, "unmapped": 1.0, "front": 0.0}),))
+    assert found["mapped_inliers"] == pytest.approx(best.registered.inliers / 0.05)
+    assert found["front"] == 0.0
 
 
 @pytest.mark.parametrize(("place_m", "expected"), [(0.0, 0.0), (9.9, 9.9), (10.1, 10.0), (1e4, 10.0)])
-def test_places_further_than_ten_metres_are_told_as_ten(candidate, weighed, place_m, expected):
-    """Calibration has seen no survey so sparse."""
+def test_distances_of_places_are_limited_to_ten_metres(candidate, weighed, place_m, expected):
+    """The calibration data contain no sparser survey."""
     best = candidate()
     assert weighed(candidates=(replace(best, scores={**best.scores, "place_m": place_m}),))["place_m"] == expected
 
@@ -100,15 +111,15 @@ def test_the_margin_is_the_support_over_the_best_rival(candidate, weighed, rival
     ],
 )
 def test_the_share_is_the_best_ones_among_all_that_exclude_each_other(candidate, weighed, supports, share):
-    """And the next frame of the same street takes nothing from it."""
+    """Another frame of the same street does not change the share."""
     apart = [candidate(support, xyz=(20 * k, 0, 1.5)) for k, support in enumerate(supports)]
     near = [candidate(support, xyz=(20 * k + 1, 0, 1.5)) for k, support in enumerate(supports)]
     for candidates in (apart, [*apart, *near]):
         assert weighed(candidates=tuple(candidates))["log_share"] == pytest.approx(np.log(share))
 
 
-def test_the_similarity_is_told_against_the_best_place_that_is_another(weighed):
-    """10.1 m along or across is another place, 9.9 m is not; height does not make one."""
+def test_the_similarity_margin_is_against_the_best_other_place(weighed):
+    """A place 10.1 m along or across is another place, one at 9.9 m is not. Height does not count."""
     places = [
         neighbour(0, 0.95),
         neighbour(9.9, 0.9),
@@ -147,12 +158,12 @@ def test_a_sparse_survey_has_fewer_places_to_vote_but_no_smaller_a_share(weighed
 @pytest.mark.parametrize(
     ("weights", "entropy"), [([1.0], 0.0), ([0.25] * 4, np.log(4)), ([0.5, 0.5], np.log(2)), ([1.0, 0.0], 0.0)]
 )
-def test_entropy_tells_among_how_many_clusters_the_weight_is_spread(weighed, weights, entropy):
+def test_entropy_measures_over_how_many_clusters_the_weight_is_spread(weighed, weights, entropy):
     assert weighed(weights=weights)["entropy"] == pytest.approx(entropy, abs=1e-9)
 
 
 def test_sigma_is_that_of_the_worst_horizontal_direction(weighed):
-    """0.3 m along a street that runs at 30 degrees, 0.1 m across; 2 m of height do not count."""
+    """Sigma is 0.3 m along a street at 30 degrees and 0.1 m across. The 2 m of height do not count."""
     R = rotation_z(np.deg2rad(30))
     covariance = np.eye(6)
     covariance[:3, :3] = R @ np.diag([0.09, 0.01, 4.0]) @ R.T
@@ -160,7 +171,7 @@ def test_sigma_is_that_of_the_worst_horizontal_direction(weighed):
 
 
 @pytest.mark.parametrize("scale", [1.02, 1 / 1.02])
-def test_scale_is_told_in_hundredths_whichever_way_it_is_off(candidate, weighed, scale):
+def test_the_scale_feature_is_unsigned_and_in_percent(candidate, weighed, scale):
     assert weighed(candidates=(candidate(scale=scale),))["scale"] == pytest.approx(100 * np.log(1.02))
 
 
@@ -195,7 +206,7 @@ def test_margins_of_several_frames_count_by_the_root_of_their_number(candidate, 
 
 
 def test_the_shape_is_that_of_the_view_straight_ahead(frame, weighed):
-    """Of three turns the middle one: a wall 6 m ahead with a post, whatever the others show."""
+    """The middle one of three turns counts: a wall 6 m ahead with a post. The others have no effect."""
     planes = np.zeros((3, 6, ViewGrid().rows, ViewGrid().columns), np.float32)
     planes[1, 0] = 6.0
     planes[1, 0, :, 40:44] = 3.0
@@ -227,7 +238,7 @@ def test_the_spread_is_that_of_the_five_most_similar_places(weighed, x_m, expect
 
 @pytest.mark.parametrize("features", [FEATURES[::-1], (*FEATURES[:-1], "more")])
 def test_a_calibration_of_other_features_is_refused(calibration_json, features):
-    document = calibration_json(features=list(features))
+    document = calibration_json(features=[{"name": name, "mean": 0.0, "std": 1.0} for name in features])
     calibration = read_calibration(json.dumps(document).encode(), path="x")
     with pytest.raises(
         BundleError, match=r"^maps/town: the confidence features are not those of this release \(margin, inliers"

@@ -8,13 +8,12 @@ from service.scoring.support import SupportWeights
 
 @pytest.fixture
 def calibration(calibration_of):
-    """Means of 2 and standard deviations of 0.5 for all evidence."""
-    flat = calibration_of().right.model_dump()
-    return calibration_of(right=flat | {"mean": [2.0] * len(FEATURES), "spread": [0.5] * len(FEATURES)})
+    """Return a calibration with means 2 and standard deviations 0.5 for all features."""
+    return calibration_of(features=[{"name": name, "mean": 2.0, "std": 0.5} for name in FEATURES])
 
 
 def evidence_of(**deviations):
-    """A row of evidence that lies so many standard deviations from the means."""
+    """Return a row of features at the given numbers of standard deviations from the means."""
     row = np.full(len(FEATURES), 2.0)
     for name, size in deviations.items():
         row[FEATURES.index(name)] += 0.5 * size
@@ -37,7 +36,7 @@ def test_evidence_in_the_range_that_calibration_saw_gives_none(calibration, size
     assert reasons_of(calibration, evidence_of(**dict.fromkeys(FEATURES, size))) == ()
 
 
-def test_the_likeliest_reason_comes_first_and_one_remedy_is_told_once(calibration):
+def test_the_likeliest_reason_comes_first_and_each_remedy_appears_once(calibration):
     evidence = evidence_of(
         margin=-5, front=4, through=8, points=-3.5, measured=-4, scale=6, facings=-10, similarity=-9, inliers=-2
     )
@@ -51,9 +50,10 @@ def test_the_likeliest_reason_comes_first_and_one_remedy_is_told_once(calibratio
     ]
 
 
-def test_all_evidence_that_confidence_weighs_has_one_remedy():
+def test_every_feature_of_the_confidence_has_one_remedy():
     names = [name for _, features, _ in GROUPS for name in features]
-    assert sorted(names) == sorted(set(FEATURES) - set(UNWEIGHED))
+    assert sorted(names) == sorted(set(FEATURES) - {"similarity", "log_share"})
+    assert set(FEATURES) - set(UNWEIGHED) <= set(names)
 
 
 def test_pictures_that_hold_too_little_to_register_speak_of_depth(calibration):
@@ -62,12 +62,12 @@ def test_pictures_that_hold_too_little_to_register_speak_of_depth(calibration):
     assert "depth.scale_m" in reason.remedy
 
 
-def test_support_is_what_the_judge_gives_for_inliers_and_similarity():
+def test_support_is_the_weighted_sum_of_inliers_and_similarity():
     weights = SupportWeights()
     assert support_of(0.5, 0.75) == 0.5 * weights.inliers + 0.75 * weights.similarity == 61.0
 
 
-def test_a_depth_in_another_unit_is_the_first_reason_and_is_told_once(calibration):
+def test_a_depth_in_another_unit_is_the_first_reason_and_is_reported_once(calibration):
     evidence = evidence_of(facings=-10, scale=6)
     depth_m = np.full((4, 4), 5000, np.float32)
     unit, intrinsics = reasons_of(calibration, evidence, depth_m)

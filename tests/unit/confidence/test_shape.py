@@ -10,7 +10,7 @@ LEAST = np.log(1e-3)
 
 
 def plane(normal, distance_m):
-    """Ranges of an endless plane before the camera (level frame: x ahead, y left, z up); 0 where a ray never meets it."""
+    """Return the ranges of an infinite plane (level frame: x ahead, y left, z up); 0 where a ray does not intersect it."""
     along = RAYS @ (np.array(normal, float) / np.linalg.norm(normal))
     return np.where(along > 1e-3, distance_m / np.maximum(along, 1e-3), 0.0).astype(np.float32)
 
@@ -30,14 +30,14 @@ def test_a_wall_faces_one_way(turn_deg):
     assert shape(plane((np.cos(turn), np.sin(turn), 0), 6.0)).facings == pytest.approx(LEAST, abs=0.05)
 
 
-def test_a_corner_in_the_middle_of_the_view_faces_both_ways_alike():
-    """Two walls at right angles, half of the cells each: both eigenvalues are a half."""
+def test_a_corner_in_the_middle_of_the_view_has_equal_eigenvalues():
+    """Two walls at right angles fill half of the cells each. Both eigenvalues are 0.5."""
     corner = nearest(plane((1, 1, 0), 6.0), plane((1, -1, 0), 6.0))
     assert shape(corner).facings == pytest.approx(np.log(0.5), abs=0.02)
 
 
 def test_a_wall_of_a_quarter_of_the_cells_is_a_quarter():
-    """A wall beside from 22.5 degrees to the left on: its normal is across that of the one ahead."""
+    """A wall on the left fills the cells beyond 22.5 degrees. Its normal is perpendicular to that of the wall ahead."""
     left = np.deg2rad(22.5)
     both = nearest(plane((1, 0, 0), 6.0), plane((0, 1, 0), 6.0 * np.tan(left)))
     assert np.exp(shape(both).facings) == pytest.approx(0.25, abs=0.03)
@@ -48,8 +48,8 @@ def test_ground_and_ceiling_face_no_way():
     assert shape(level).facings == pytest.approx(LEAST)
 
 
-def test_what_breaks_off_is_no_surface():
-    """Alternating columns of two walls far behind each other: only edges, no facing between them."""
+def test_depth_edges_are_no_surface():
+    """Alternating columns show two walls far behind each other. All cells are edges, and no pair of cells has a normal."""
     far, near = plane((1, 0, 0), 20.0), plane((1, 0, 0), 5.0)
     striped = np.where(np.arange(GRID.columns) % 2 == 0, near, far).astype(np.float32)
     found = shape(striped)

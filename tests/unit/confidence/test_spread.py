@@ -32,7 +32,7 @@ def test_two_hypotheses_forty_metres_apart_are_twenty_metres_from_their_middle()
 
 
 def test_one_hypothesis_that_is_probably_wrong_has_the_size_of_the_map():
-    """The finding: a single wrong hypothesis said 0.14 m at an error of 322 m."""
+    """Found in an evaluation: a single wrong hypothesis stated 0.14 m at an error of 322 m."""
     found = spread([pose(10)], [1.0], confidence=0.02)
     assert found.hypotheses_weight == 0.02
     assert np.sqrt(found.covariance[0, 0]) > 55
@@ -47,7 +47,7 @@ def test_without_hypotheses_it_is_the_map():
 
 
 def test_headings_go_round_the_circle():
-    """20 degrees to either side of the half turn, as far from the mean as 20 degrees to either side of 0."""
+    """20 degrees on both sides of 180 degrees differ from the mean as much as 20 degrees on both sides of 0."""
     across = spread([pose(0, heading_deg=160), pose(0, heading_deg=-160)], [0.5, 0.5], confidence=0.5)
     ahead = spread([pose(0, heading_deg=20), pose(0, heading_deg=-20)], [0.5, 0.5], confidence=0.5)
     assert across.heading_std_rad == pytest.approx(ahead.heading_std_rad)
@@ -56,7 +56,7 @@ def test_headings_go_round_the_circle():
     assert opposed.heading_std_rad == UNKNOWN_HEADING_RAD
 
 
-def test_one_sure_hypothesis_is_told_as_it_is():
+def test_one_certain_hypothesis_is_reported_unchanged():
     found = spread([pose(3, 4, heading_deg=30)], [1.0], confidence=1.0)
     np.testing.assert_allclose(found.mean_m, [3, 4, 1.5])
     np.testing.assert_allclose(found.covariance, 0.01 * np.eye(3), atol=1e-12)
@@ -69,7 +69,7 @@ def test_one_sure_hypothesis_is_told_as_it_is():
     confidence=st.floats(0, 1),
 )
 def test_every_hypothesis_lies_within_what_its_weight_allows(xs, supports, confidence):
-    """Of a mixture a part of weight w lies within sqrt((1 - w) / w) standard deviations of the mean, in every direction."""
+    """A component with weight w lies within sqrt((1 - w) / w) standard deviations of the mean, in every direction."""
     shares = np.exp(np.sort(supports[: len(xs)])[::-1])
     shares /= shares.sum()
     found = spread([pose(x) for x in xs], shares, confidence=confidence)

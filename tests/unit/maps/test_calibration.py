@@ -7,11 +7,10 @@ from hypothesis import strategies as st
 
 from service.confidence.features import FEATURES, RIVALRY, UNWEIGHED
 from service.errors import BundleError
-from service.maps.calibration import Calibration, Logistic, expanded, probability, read_calibration, terms
+from service.maps.calibration import AdditiveModel, Calibration, Term, probability, read_calibration
 from service.maps.content import UNCALIBRATED
 
-COUNT, NOISE = len(FEATURES), FEATURES.index("log_noise")
-TERMS = COUNT + COUNT * (COUNT + 1) // 2
+COUNT = len(FEATURES)
 PATH = "maps/town/calibration.json"
 SITE = {"offset": -1.0, "queries": 200, "right": 150, "expected_calibration_error": 0.02}
 
@@ -28,24 +27,28 @@ def refused(document, what):
 
 @pytest.fixture
 def document(calibration_json):
-    """To spoil."""
+    """Return a valid document that a test then damages."""
     return json.loads(json.dumps(calibration_json()))
 
 
-def one_hot(size, **values):
-    found = np.zeros(size)
-    for index, value in values.items():
-        found[int(index[1:])] = value
-    return found
+def random_terms(rng, scale=1.0):
+    """Return a term with three knots for every feature."""
+    return [
+        {
+            "feature": name,
+            "knots": (np.array([-1.0, 0.0, 1.0]) + rng.uniform(-0.4, 0.4, 3)).tolist(),
+            "log_odds": rng.normal(0, scale, 3).tolist(),
+        }
+        for name in FEATURES
+    ]
 
 
-def test_what_is_written_is_read_again(document):
+def test_written_values_are_read_again(document):
     rng = np.random.default_rng(3)
     for name in ("right", "known"):
-        document[name] = {
-            "mean": rng.normal(size=COUNT).tolist(), "spread": rng.uniform(0.1, 9, COUNT).tolist(),
-            "weights": rng.normal(size=TERMS).tolist(), "bias": float(rng.normal()),
-        }  # fmt: skip
+        document[name] = {"terms": random_terms(rng), "bias": float(rng.normal())}
+    for row in document["features"]:
+        row |= {"mean": float(rng.normal()), "std": float(rng.uniform(0.1, 9))}
     document["site"] = SITE
     calibration = read(document)
     assert json.loads(calibration.model_dump_json()) == document
@@ -75,9 +78,13 @@ def test_a_document_that_is_neither_is_refused_with_the_file_the_reason_and_what
     assert error.value.field == "calibration.json"
 
 
-@pytest.mark.parametrize("features", [FEATURES[:-1], (*FEATURES, "more"), ()])
-def test_a_calibration_of_another_number_of_features_is_refused(document, features):
-    refused(document | {"features": list(features)}, f"right: mean and spread need {len(features)} numbers")
+def test_a_term_of_an_unknown_feature_is_refused(document):
+    document["known"]["terms"] = [{"feature": "weather", "knots": [0, 1], "log_odds": [0, 1]}]
+    refused(document, "known: weather is not one of the features")
+
+
+def test_a_calibration_without_features_is_refused(document):
+    refused(document | {"features": []}, "features")
 
 
 def test_thresholds_that_do_not_rise_are_refused(document):
@@ -90,23 +97,37 @@ def test_a_calibration_without_thresholds_is_refused(document):
     refused(document | {"thresholds": []}, "thresholds")
 
 
-@pytest.mark.parametrize(("name", "length"), [("mean", COUNT - 1), ("spread", COUNT + 1), ("weights", COUNT)])
+@pytest.mark.parametrize(
+    ("knots", "log_odds", "what"),
+    [
+        ([0.0, 1.0], [0.0], "margin: 2 knots need as many log_odds, not 1"),
+        ([0.0, 0.0], [0.0, 1.0], "margin: knots must rise"),
+        ([0.0, 2.0, 1.0], [0.0, 1.0, 2.0], "margin: knots must rise"),
+        ([0.0], [0.0], "knots: Tuple should have at least 2 items"),
+    ],
+)
 @pytest.mark.parametrize("part", ["right", "known"])
-def test_a_regression_of_another_length_is_refused(document, part, name, length):
-    document[part][name] = [1.0] * length
-    refused(document, f"{part}: mean and spread need {COUNT} numbers, weights {TERMS}")
+def test_a_term_that_is_no_function_is_refused(document, part, knots, log_odds, what):
+    document[part]["terms"] = [{"feature": "margin", "knots": knots, "log_odds": log_odds}]
+    refused(document, what)
 
 
-@pytest.mark.parametrize("spread", [0.0, -1.0])
-def test_a_spread_that_is_none_is_refused(document, spread):
-    document["right"]["spread"][3] = spread
-    refused(document, "right: .*spread must be positive")
+def test_two_terms_of_one_feature_are_refused(document):
+    document["right"]["terms"] = 2 * [{"feature": "margin", "knots": [0, 1], "log_odds": [0, 1]}]
+    refused(document, "a feature has two terms")
+
+
+@pytest.mark.parametrize("std", [0.0, -1.0])
+def test_a_standard_deviation_that_is_not_positive_is_refused(document, std):
+    document["features"][3]["std"] = std
+    refused(document, "features.3.std")
 
 
 @pytest.mark.parametrize(
     ("path", "value"),
     [
-        (("right", "bias"), "much"), (("right", "weights", 0), None), (("known", "mean", 2), "NaN"), (("more",), 1), (("right", "more"), 1),
+        (("right", "bias"), "much"), (("right", "terms"), None), (("features", 2, "mean"), "NaN"),
+        (("more",), 1), (("right", "more"), 1),
         (("thresholds", 0, "confidence"), 1.1), (("thresholds", 0, "confidence"), -0.1), (("thresholds", 0, "false_accept_rate"), 0.0),
         (("thresholds", 1, "false_accept_rate"), 1.0), (("site", "offset"), 1e-9), (("site", "offset"), None),
         (("site", "slope"), 1.0), (("site", "queries"), -1), (("site", "right"), -1), (("site", "expected_calibration_error"), 2.0),
@@ -129,44 +150,50 @@ def test_numbers_that_are_none_are_refused(document, number):
     refused(json.dumps(document).replace("123456.0", number).encode(), "")
 
 
-def test_features_enter_in_their_spreads_and_multiplied_by_two():
-    """Of three features, each 7 at its mean and 2 a deviation: one, minus three and a half deviations."""
-    found = expanded(np.array([9.0, 1.0, 8.0]), (7.0, 7.0, 7.0), (2.0, 2.0, 2.0))
-    assert terms(3) == ((0,), (1,), (2,), (0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
-    np.testing.assert_allclose(found, [1, -3, 0.5, 1, -3, 0.5, 9, -1.5, 0.25])
-
-
-@pytest.mark.parametrize("count", [1, 4, COUNT])
-def test_every_term_is_the_product_of_the_features_that_it_names(count):
-    evidence = np.random.default_rng(count).uniform(-2, 2, (5, count))
-    found = expanded(evidence, (0.0,) * count, (1.0,) * count)
-    named = np.stack([evidence[:, list(term)].prod(axis=1) for term in terms(count)], axis=1)
-    np.testing.assert_allclose(found, named)
-    assert len(set(terms(count))) == count + count * (count + 1) // 2
-
-
 @pytest.mark.parametrize(
     ("margin", "noise", "expected"),
     [
-        (0.0, 0.0, 0.5),  # all at their means: the bias alone
-        (2.0, 0.0, 0.5 + 10 * 2 + 100 * 4),
-        (-2.0, 0.0, 0.5 - 10 * 2 + 100 * 4),
-        (2.0, 3.0, 0.5 + 10 * 2 + 100 * 4 + 1000 * 6),
-        (2.0, -1.0, 0.5 + 10 * 2 + 100 * 4 - 1000 * 2),
-        (9.0, 0.0, 0.5 + 10 * 4 + 100 * 16),  # no further than four deviations
-        (-9.0, 9.0, 0.5 - 10 * 4 + 100 * 16 - 1000 * 16),
-        (1e300, 0.0, 0.5 + 10 * 4 + 100 * 16),
+        (0.0, 0.0, 0.5),  # the bias alone
+        (1.0, 0.0, 0.5 + 10.0),
+        (2.0, 0.0, 0.5 + 20.0),
+        (3.0, 0.0, 0.5 + 20.5),  # halfway to the last knot
+        (4.0, 0.0, 0.5 + 21.0),
+        (1e300, 0.0, 0.5 + 21.0),  # constant beyond it
+        (-1e300, 0.0, 0.5),
+        (2.0, 1.0, 0.5 + 20.0 - 100.0),
     ],
 )
-def test_log_odds_by_hand(margin, noise, expected):
-    """The margin has weight 10, its square 100, its product with the noise 1000; a deviation is 4 units above 7."""
-    square, product = terms(COUNT).index((0, 0)), terms(COUNT).index((0, NOISE))
-    weights = one_hot(TERMS, **{"_0": 10.0, f"_{square}": 100.0, f"_{product}": 1000.0})
-    mean, spread = one_hot(COUNT, _0=7.0), np.ones(COUNT) + one_hot(COUNT, _0=3.0)
-    logistic = Logistic(mean=tuple(mean), spread=tuple(spread), weights=tuple(weights), bias=0.5)
-    evidence = one_hot(COUNT, _0=7.0 + 4.0 * margin) + one_hot(COUNT, **{f"_{NOISE}": noise})
-    assert float(logistic.log_odds(evidence)) == pytest.approx(expected)
-    np.testing.assert_allclose(logistic.log_odds(np.stack([evidence, mean])), [expected, 0.5])
+def test_log_odds_by_hand(calibration_of, margin, noise, expected):
+    """The margin contributes 10 per unit up to 2 and 0.5 per unit up to 4. The noise contributes -100 per unit."""
+    terms = [
+        {"feature": "margin", "knots": [0.0, 2.0, 4.0], "log_odds": [0.0, 20.0, 21.0]},
+        {"feature": "log_noise", "knots": [-1.0, 1.0], "log_odds": [100.0, -100.0]},
+    ]
+    calibration = calibration_of(right={"terms": terms, "bias": 0.5})
+    evidence = np.zeros(COUNT)
+    evidence[FEATURES.index("margin")], evidence[FEATURES.index("log_noise")] = margin, noise
+    assert float(calibration.log_odds("right", evidence)) == pytest.approx(expected)
+    both = calibration.log_odds("right", np.stack([evidence, np.zeros(COUNT)]))
+    np.testing.assert_allclose(both, [expected, 0.5])
+
+
+@given(st.integers(0, 10**6))
+@settings(max_examples=25)
+def test_a_rising_term_never_lowers_the_log_odds(calibration_of, seed):
+    rng = np.random.default_rng(seed)
+    term = Term(feature="margin", knots=(-1.0, 0.5, 3.0), log_odds=tuple(np.sort(rng.normal(size=3)).tolist()))
+    calibration = calibration_of(right=AdditiveModel(terms=(term,), bias=0.0).model_dump())
+    evidence = np.zeros((9, COUNT))
+    evidence[:, FEATURES.index("margin")] = np.sort(rng.normal(0, 3, 9))
+    assert (np.diff(calibration.log_odds("right", evidence)) >= 0).all()
+
+
+def test_deviations_are_in_standard_deviations_from_the_mean(calibration_of, document):
+    document["features"][FEATURES.index("margin")] |= {"mean": 7.0, "std": 2.0}
+    evidence = np.zeros(COUNT)
+    evidence[FEATURES.index("margin")] = 10.0
+    found = calibration_of(features=document["features"]).deviations(evidence)
+    np.testing.assert_allclose(found, np.where(np.array(FEATURES) == "margin", 1.5, 0.0))
 
 
 @pytest.mark.parametrize(
@@ -179,7 +206,7 @@ def test_probability_of_log_odds(odds, expected):
 def test_confidence_is_the_probability_of_the_log_odds_and_the_maps_own_correction_comes_after(
     calibration_of, document
 ):
-    """A bias of log 9 is 0.9; 1 less is 0.768; a map where it needs none is not corrected."""
+    """A bias of log 9 is 0.9, and log 9 - 1 is 0.768. A map without a correction stays as it is."""
     right = document["right"] | {"bias": float(np.log(9.0))}
     evidence = np.zeros((2, COUNT))
     np.testing.assert_allclose(calibration_of(right=right).confidence(evidence), [0.9, 0.9])
@@ -201,10 +228,7 @@ def test_a_maps_own_correction_never_raises_confidence(calibration_of, calibrati
 @settings(max_examples=25)
 def test_many_answers_get_the_confidence_that_each_gets_alone(calibration_of, seed, count):
     rng = np.random.default_rng(seed)
-    right = {
-        "mean": rng.normal(size=COUNT).tolist(), "spread": rng.uniform(0.5, 2, COUNT).tolist(),
-        "weights": (0.1 * rng.normal(size=TERMS)).tolist(), "bias": 0.1,
-    }  # fmt: skip
+    right = {"terms": random_terms(rng, 0.1), "bias": 0.1}
     calibration, evidence = calibration_of(right=right), rng.normal(size=(count, COUNT))
     together = calibration.confidence(evidence)
     np.testing.assert_allclose(together, [float(calibration.confidence(row)) for row in evidence])
@@ -215,10 +239,8 @@ def test_many_answers_get_the_confidence_that_each_gets_alone(calibration_of, se
     ("rate", "confidence"),
     [(0.001, 0.9), (0.005, 0.8), (0.0049, 0.9), (0.007, 0.8), (0.01, 0.4), (0.5, 0.4), (0.0001, 0.9)],
 )
-def test_the_threshold_is_that_of_the_greatest_rate_that_is_not_beyond_the_one_asked_for(
-    calibration_of, rate, confidence
-):
-    """Below the least rate that was measured, its threshold is the most cautious there is."""
+def test_the_threshold_is_that_of_the_largest_rate_not_above_the_requested_one(calibration_of, rate, confidence):
+    """Below the smallest measured rate, the threshold is the strictest one."""
     rates = {0.001: 0.9, 0.005: 0.8, 0.01: 0.4}
     thresholds = [{"false_accept_rate": each, "confidence": at} for each, at in rates.items()]
     assert calibration_of(thresholds=thresholds).threshold(rate) == confidence

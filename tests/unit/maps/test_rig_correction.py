@@ -22,7 +22,8 @@ from service.maps.reader import MapBundle
 from service.maps.writer import replace_calibration, write_bundle
 
 RIG = {
-    "scale": 0.5, "offset": -1.0, "source": "drive", "measured_on": "a drive", "frames": 40, "right": 20, "outside": 15,
+    "scale": 0.5, "offset": -1.0, "lower_only": False, "source": "drive", "measured_on": "a drive",
+    "frames": 40, "right": 20, "outside": 15,
     "error_before": 0.2, "error_after": 0.05, "accepted": 18, "accepted_wrong": 1, "wrong_share_upper": 0.24,
     "outside_accepted": 0, "outside_share_upper": 0.18,
 }  # fmt: skip
@@ -37,6 +38,11 @@ def test_the_formula_by_hand(calibration_of):
     calibration = calibration_of(right={"terms": [], "bias": 4.0}, rig=RIG)
     assert float(calibration.confidence(np.zeros(len(FEATURES)))) == pytest.approx(0.7310586)
     np.testing.assert_allclose(rig().corrected(np.array([0.0, 2.0, -2.0])), [-1, 0, -2])
+
+
+def test_a_correction_that_may_only_lower_leaves_what_it_would_raise():
+    """0.5 x -4 + 0 = -2 is more than -4. 0.5 x 4 = 2 is less than 4."""
+    np.testing.assert_allclose(rig(offset=0, lower_only=True).corrected(np.array([-4.0, 4.0])), [-4, 2])
 
 
 def test_the_correction_of_the_rig_comes_after_that_of_the_site(calibration_of):
@@ -62,10 +68,10 @@ def test_a_correction_that_makes_no_sense_is_refused(changed):
         rig(**changed)
 
 
-@given(st.lists(st.floats(-30, 30), min_size=2, max_size=50), st.floats(0.2, 5), st.floats(-10, 10))
-def test_no_correction_inverts_the_order_of_two_answers(odds, scale, offset):
+@given(st.lists(st.floats(-30, 30), min_size=2, max_size=50), st.floats(0.2, 5), st.floats(-10, 10), st.booleans())
+def test_no_correction_inverts_the_order_of_two_answers(odds, scale, offset, lower_only):
     given_odds = np.sort(np.array(odds))
-    confidence = probability(rig(scale=scale, offset=offset).corrected(given_odds))
+    confidence = probability(rig(scale=scale, offset=offset, lower_only=lower_only).corrected(given_odds))
     assert (np.diff(confidence) >= 0).all()
 
 

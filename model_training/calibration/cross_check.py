@@ -1,0 +1,138 @@
+"""Predict each rig family by a calibration that was fitted without it: what a user with another rig can expect."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from model_training.calibration.fit import Asked, confidences, expected_calibration_error, fit
+from service.confidence.decision import decide
+from service.maps.calibration import Calibration
+from service.option_limits import FALSE_ACCEPT_RATE
+
+
+@dataclass(frozen=True, slots=True)
+class FamilyFigures:
+    """Figures of a rig family, by a calibration without it. Shares refer to the queries in the map unless stated otherwise.
+
+    Attributes:
+        family: name of the family.
+        inside: number of queries in the map.
+        outside: number of out-of-map queries.
+        ece: expected calibration error over all queries.
+        within_1_m: share of answers within 1 m, whatever their status.
+        localized: share of LOCALIZED answers.
+        right_but_refused: share of answers that are right and not LOCALIZED.
+        wrong_of_localized: share of the LOCALIZED answers that are wrong. It counts all queries; outside the map each answer is wrong.
+        outside_accepted: share of the out-of-map queries that are LOCALIZED.
+    """
+
+    family: str
+    inside: int
+    outside: int
+    ece: float
+    within_1_m: float
+    localized: float
+    right_but_refused: float
+    wrong_of_localized: float
+    outside_accepted: float
+
+
+def cross_check(
+    asked: Asked, *, not_fitted: Sequence[str] = (), false_accept_rate: float = FALSE_ACCEPT_RATE
+) -> list[FamilyFigures]:
+    """Predict each rig family from the others.
+
+    Args:
+        asked: calibration data of all families.
+        not_fitted: names of the families that take part in no fit.
+        false_accept_rate: the rate whose threshold decides the status.
+
+    Raises:
+        DatasetError: the other families lack right answers, wrong answers, queries in the map or out-of-map queries.
+    """
+    usable = ~np.isin(asked.family, not_fitted)
+    found = []
+    for family in np.unique(asked.family):
+        own = asked.family == family
+        calibration = fit(asked.where(usable & ~own), measured_on={})
+        found.append(figures_of(str(family), asked.where(own), calibration, false_accept_rate))
+    return found
+
+
+def figures_of(name: str, own: Asked, calibration: Calibration, false_accept_rate: float) -> FamilyFigures:
+    """Return the figures of some queries.
+
+    Args:
+        name: name of these queries.
+        own: the queries.
+        calibration: calibration that was fitted to others.
+        false_accept_rate: the rate whose threshold decides the status.
+    """
+    confidence = confidences(calibration, own)
+    localized = accepted(own, calibration, confidence, false_accept_rate)
+    inside, outside = own.known, ~own.known
+    return FamilyFigures(
+        family=name,
+        inside=int(inside.sum()),
+        outside=int(outside.sum()),
+        ece=expected_calibration_error(confidence, own.right),
+        within_1_m=_share(own.right[inside]),
+        localized=_share(localized[inside]),
+        right_but_refused=_share((own.right & ~localized)[inside]),
+        wrong_of_localized=_share(~own.right[localized]),
+        outside_accepted=_share(localized[outside]),
+    )
+
+
+def accepted(
+    asked: Asked, calibration: Calibration, confidence: NDArray[np.float64], false_accept_rate: float
+) -> NDArray[np.bool_]:
+    """Return whether each answer is LOCALIZED (n,), by the rules of ``service.confidence.decision.decide``.
+
+    Args:
+        asked: calibration data.
+        calibration: calibration of the map.
+        confidence: confidence of each query (n,).
+        false_accept_rate: the rate whose threshold decides.
+    """
+    found = confidence >= calibration.threshold(false_accept_rate)
+    for k in np.flatnonzero(found):
+        found[k] = decide(calibration, asked.evidence[k], false_accept_rate).status == "LOCALIZED"
+    return found
+
+
+def table(figures: list[FamilyFigures]) -> list[str]:
+    """Return the figures as lines of text, the largest calibration error first.
+
+    Args:
+        figures: figures of the families.
+    """
+    heads = (f"{head:>{width}}" for head, width in zip(_HEADS, _WIDTHS, strict=True))
+    lines = [
+        "each rig family, by a calibration without it (shares in %)",
+        f"{'family':<14}{'queries':>12}" + "".join(heads),
+    ]
+    for each in sorted(figures, key=lambda figure: -figure.ece):
+        queries = f"{each.inside}+{each.outside}"
+        shares = (
+            each.ece,
+            each.within_1_m,
+            each.localized,
+            each.right_but_refused,
+            each.wrong_of_localized,
+            each.outside_accepted,
+        )
+        columns = (f"{100 * share:>{width}.1f}" for share, width in zip(shares, _WIDTHS, strict=True))
+        lines.append(f"{each.family:<14}{queries:>12}" + "".join(columns))
+    return lines
+
+
+#: Columns of ``table``.
+_HEADS = ("ECE", "within 1 m", "LOCALIZED", "right, refused", "wrong of LOCALIZED", "outside accepted")
+_WIDTHS = (7, 12, 11, 16, 20, 18)
+
+
+def _share(events: NDArray[np.bool_]) -> float:
+    return float(events.mean()) if len(events) else 0.0

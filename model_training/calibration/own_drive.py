@@ -1,0 +1,187 @@
+"""Labelled frames from a recording of the robot itself: ``streetfix calibrate --map M --drive DATASET``.
+
+Each image pair is one query. Ground truth labels its answer, else the odometry does (``odometry_labels``). Each frame in the map is asked
+a second time, in the map without the places around it (``elsewhere``). So the same images also show what an out-of-map query of this rig
+gets.
+"""
+
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from model_training.calibration.elsewhere import is_outside, without_surroundings
+from model_training.calibration.odometry_labels import LABEL_NOISE, MARGIN, Labels, labels_by_odometry
+from model_training.calibration.own_rig import LabelledFrames, blocks_of, frames_of, joined_frames
+from model_training.datasets.dataset import ODOMETRY_FILE, Dataset, QueryFrame, query_folder
+from model_training.evaluation.predict import in_order
+from service.errors import DatasetError, NoDepthError
+from service.localization.answer import Answer
+from service.localization.localizer import Localizer
+from service.maps.calibration import RIGHT_M
+
+#: Largest number of frames that are asked a second time, evenly spread over a query set.
+MOST_ELSEWHERE = 300
+#: Progress callback: stage, finished steps, all steps.
+Report = Callable[[str, int, int], None]
+
+
+@dataclass(frozen=True, eq=False)
+class DriveFrames:
+    """Labelled frames of a recording, and what they come from.
+
+    Attributes:
+        frames: the labelled frames. Out-of-map frames are those of the recording and those in the map without their surroundings.
+        label_noise: share of wrong labels.
+        described: description of the recording for readers.
+        unlabelled: number of images without a label.
+        unregistered: number of images with too few points to register.
+    """
+
+    frames: LabelledFrames
+    label_noise: float
+    described: str
+    unlabelled: int
+    unregistered: int
+
+
+def frames_of_drive(
+    localizer: Localizer,
+    dataset: Dataset,
+    names: Sequence[str],
+    *,
+    odometry_noise: float,
+    workers: int = 2,
+    report: Report = lambda *_: None,
+) -> DriveFrames:
+    """Localize and label the images of a recording.
+
+    Args:
+        localizer: localizer of the map.
+        dataset: the recording, in the map frame.
+        names: names of the query sets; empty for all.
+        odometry_noise: standard deviation of the odometry's end point, as a share of the travelled distance. Ground truth needs none.
+        workers: number of queries that are localized at the same time.
+        report: called after every query.
+
+    Raises:
+        DatasetError: the dataset has no queries, or a set has neither ground truth nor odometry, or its odometry lacks a line.
+    """
+    names = list(names) or dataset.query_sets()
+    if not names:
+        raise DatasetError(f"{dataset.folder} has no query sets; import the recording with its images", field="queries")
+    sets = [_QuerySet.of(dataset, name) for name in names]
+    parts, unlabelled, unregistered, outside = list[LabelledFrames](), 0, 0, 0
+    for each in sets:
+        answers = _answers(f"queries {each.name}", [(frame, localizer) for frame in each.frames], workers, report)
+        labels = each.labels(answers, odometry_noise)
+        is_out = is_outside(localizer.bundle.T_map_place[:, :2, 3], labels.reference_xy, MARGIN * labels.sigma_m)
+        labelled = labels.right | labels.wrong
+        evidence = [None if answer is None else answer.evidence for answer in answers]
+        unlabelled += int((~labelled).sum())
+        unregistered += sum(1 for row, known in zip(evidence, labelled, strict=True) if row is None and known)
+        outside += int((is_out & labelled).sum())
+        block = blocks_of(len(answers))
+        of_label = [row if known else None for row, known in zip(evidence, labelled, strict=True)]
+        parts.append(frames_of(of_label, labels.right, is_out, block))
+        parts.append(_elsewhere(localizer, each, labels, is_out, block, workers, report))
+    how = {True: "ground truth", False: "odometry"}
+    sources = " and ".join(dict.fromkeys(how[each.has_truth] for each in sets))
+    noise = 0.0 if all(each.has_truth for each in sets) else LABEL_NOISE
+    described = f"{dataset.name}, {', '.join(names)}, labelled by {sources}, {outside} images from outside the map"
+    return DriveFrames(joined_frames(parts), noise, described, unlabelled, unregistered)
+
+
+@dataclass(frozen=True, eq=False)
+class _QuerySet:
+    """Images of a query set with ground truth or odometry, a pose per image (n, 4, 4)."""
+
+    name: str
+    frames: list[QueryFrame]
+    poses: NDArray[np.float64]
+    has_truth: bool
+
+    @classmethod
+    def of(cls, dataset: Dataset, name: str) -> "_QuerySet":
+        frames = list(dataset.queries(name))
+        folder = query_folder(dataset.folder, name)
+        if not frames:
+            raise DatasetError(f"{folder} has no images; choose another set with --queries", field="queries")
+        truth = [frame.T_map_camera for frame in frames if frame.T_map_camera is not None]
+        if truth:
+            return cls(name, frames, np.array(truth), True)
+        odometry = dataset.odometry(name)
+        if odometry is None:
+            raise DatasetError(
+                f"{folder} has neither poses.txt nor {ODOMETRY_FILE}, so nothing labels its answers; add one of them: "
+                f"poses.txt with T_map_camera (ground truth) or {ODOMETRY_FILE} with T_odom_camera (drift is allowed), TUM "
+                "format, a line per image",
+                field="queries",
+            )
+        if frames[-1].number >= len(odometry):
+            raise DatasetError(
+                f"{folder / ODOMETRY_FILE} has {len(odometry)} lines, none for {frames[-1].rgb_path.name}; write a line per image",
+                field=ODOMETRY_FILE,
+            )
+        return cls(name, frames, odometry[[frame.number for frame in frames]], False)
+
+    def labels(self, answers: list[Answer | None], odometry_noise: float) -> Labels:
+        """Return the labels of the answers; ground truth is exact and labels all."""
+        T_answer, covariance = np.full((len(answers), 4, 4), np.nan), np.full((len(answers), 6, 6), np.nan)
+        for k, answer in enumerate(answers):
+            if answer is not None and answer.evidence is not None:
+                T_answer[k] = answer.T_map_camera_guess
+                if answer.covariance is not None:
+                    covariance[k] = answer.covariance
+        if not self.has_truth:
+            return labels_by_odometry(T_answer, covariance, self.poses, odometry_noise)
+        true_xy = self.poses[:, :2, 3]
+        right = np.linalg.norm(T_answer[:, :2, 3] - true_xy, axis=1) <= RIGHT_M  # NaN compares as False
+        return Labels(right, ~right, true_xy, np.zeros(len(answers)))
+
+
+def _elsewhere(
+    localizer: Localizer,
+    query_set: _QuerySet,
+    labels: Labels,
+    is_out: NDArray[np.bool_],
+    block: NDArray[np.int64],
+    workers: int,
+    report: Report,
+) -> LabelledFrames:
+    """Ask frames in the map again, in the map without the places around them."""
+    rows = _spread(np.flatnonzero(np.isfinite(labels.sigma_m) & ~is_out))
+    rests = [without_surroundings(localizer, labels.reference_xy[k]) for k in rows]
+    pairs = [(query_set.frames[k], rest) for k, rest in zip(rows, rests, strict=True) if rest is not None]
+    answers = _answers(f"out-of-map {query_set.name}", pairs, workers, report)
+    evidence = [None if answer is None else answer.evidence for answer in answers]
+    blocks = block[rows][[rest is not None for rest in rests]]
+    return frames_of(evidence, np.zeros(len(pairs), bool), np.ones(len(pairs), bool), blocks)
+
+
+def _spread(rows: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Return at most ``MOST_ELSEWHERE`` of the rows, evenly spread."""
+    count = min(len(rows), MOST_ELSEWHERE)
+    return rows[np.linspace(0, len(rows) - 1, count).astype(int)] if count else rows
+
+
+def _answers(
+    stage: str, pairs: list[tuple[QueryFrame, Localizer]], workers: int, report: Report
+) -> list[Answer | None]:
+    """Localize images, each by its own localizer; None for an image without depth in the view grid."""
+
+    def ask(pair: tuple[QueryFrame, Localizer]) -> Answer | None:
+        frame, localizer = pair
+        try:
+            return localizer.localize(frame.query(localizer.bundle.grid))
+        except NoDepthError:
+            return None
+
+    found = list[Answer | None]()
+    with ThreadPoolExecutor(workers) as pool:
+        for answer in in_order(pool, ask, pairs, ahead=4 * workers):
+            found.append(answer)
+            report(stage, len(found), len(pairs))
+    return found

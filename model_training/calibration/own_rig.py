@@ -1,0 +1,368 @@
+"""Learn the correction of the confidence for one rig from labelled frames of this rig (decision 0150).
+
+The correction has two numbers, so a few dozen frames are enough. A prior holds it near no correction. Cross-validation over blocks of
+consecutive frames says what it brings.
+"""
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import stats
+from scipy.optimize import minimize
+
+from service.confidence.features import FEATURES
+from service.errors import DatasetError
+from service.maps.calibration import Calibration, RigCorrection, probability
+from service.option_limits import FALSE_ACCEPT_RATE
+
+#: Standard deviations of the prior: of the offset in nats of log odds, and of the scale. The prior of the offset is that of a site
+#: (decision 0030). One standard deviation of the scale changes log odds of 4 by one nat.
+PRIOR_OFFSET_NATS, PRIOR_SCALE = 1.0, 0.25
+#: Smallest scale. With a smaller one, all answers would get nearly the same confidence.
+LEAST_SCALE = 0.2
+#: Scales and offsets from which the search for the best correction starts.
+_SCALES, _OFFSETS = (0.2, 0.35, 0.5, 0.75, 1.0, 1.5), (-4.0, -2.0, -1.0, -0.5, 0.0, 0.5, 1.0, 2.0)
+#: Number of blocks of the cross-validation.
+BLOCKS = 5
+#: Confidence of the upper bounds, one-sided.
+BOUND = 0.95
+#: Share of wrong answers among accepted answers that a robot's owner usually asks for. The report says whether the frames support it.
+WRONG_RATE = 0.01
+#: Frames in a bin of the calibration error, at least, and the largest number of bins.
+_BIN_FRAMES, _BINS = 20, 15
+_SHARE, _HALF = FEATURES.index("log_share"), float(np.log(0.5))
+
+
+@dataclass(frozen=True, eq=False)
+class LabelledFrames:
+    """Answers to frames of one rig, with their labels. Frames without confidence features are left out.
+
+    Attributes:
+        evidence: confidence features in the order of ``FEATURES`` (n, F).
+        right: whether the position of the answer is right (n,). Out-of-map frames are never right.
+        outside: whether the frame is an out-of-map frame (n,).
+        block: number of the block of consecutive frames for the cross-validation (n,).
+    """
+
+    evidence: NDArray[np.float64]
+    right: NDArray[np.bool_]
+    outside: NDArray[np.bool_]
+    block: NDArray[np.int64]
+
+    def __len__(self) -> int:
+        return len(self.right)
+
+    def where(self, keep: NDArray[np.bool_]) -> "LabelledFrames":
+        """Return some of the frames.
+
+        Args:
+            keep: whether to keep each frame (n,).
+        """
+        return LabelledFrames(*(getattr(self, name)[keep] for name in LabelledFrames.__dataclass_fields__))
+
+
+def blocks_of(count: int) -> NDArray[np.int64]:
+    """Return the block of each of some consecutive frames: ``BLOCKS`` blocks of equal length (n,).
+
+    Args:
+        count: number of frames.
+    """
+    return np.arange(count, dtype=np.int64) * BLOCKS // max(1, count)
+
+
+def learn_correction(
+    calibration: Calibration,
+    frames: LabelledFrames,
+    *,
+    source: Literal["drive", "rendered"],
+    measured_on: str,
+    label_noise: float = 0.0,
+) -> RigCorrection:
+    """Fit the correction, measure it by cross-validation, and bound the share of wrong answers.
+
+    The correction may only lower the confidence (``lower_only``) in three cases: the images are rendered, there is no out-of-map frame, or
+    a threshold would let through more out-of-map frames than its rate. If the correction does not improve the cross-validated log loss,
+    there is none: scale 1 and offset 0.
+
+    Args:
+        calibration: calibration of the map. Its earlier correction for a rig does not count.
+        frames: the labelled frames.
+        source: origin of the frames.
+        measured_on: description of the frames.
+        label_noise: share of wrong labels.
+
+    Raises:
+        DatasetError: no frame in the map has confidence features.
+    """
+    inside = ~frames.outside
+    if not inside.any():
+        raise DatasetError(
+            f"{measured_on}: no frame in the map could be registered and labelled; give images from the map, with poses in its frame",
+            field="queries",
+        )
+    stock = calibration.model_copy(update={"rig": None})
+    before = np.asarray(stock.confidence(frames.evidence))
+    odds, weight = log_odds_of(before), weights_of(frames.outside)
+    lower_only = source == "rendered" or not frames.outside.any()
+    after = _cross_validated(odds, frames, lower_only, label_noise)
+    if not lower_only and not _keeps_rates(stock, before[frames.outside], after[frames.outside]):
+        lower_only = True
+        after = _cross_validated(odds, frames, lower_only, label_noise)
+    if _log_loss(after, frames.right, weight, label_noise) < _log_loss(before, frames.right, weight, label_noise):
+        scale, offset = fit_correction(odds, frames.right, weight, lower_only=lower_only, label_noise=label_noise)
+    else:
+        (scale, offset), after = (1.0, 0.0), before
+    accepted = (after >= stock.threshold(FALSE_ACCEPT_RATE)) & (frames.evidence[:, _SHARE] > _HALF)
+    counts = [int(each.sum()) for each in (accepted & inside, accepted & inside & ~frames.right, accepted & ~inside)]
+    return RigCorrection(
+        scale=scale,
+        offset=offset,
+        lower_only=lower_only,
+        source=source,
+        measured_on=measured_on,
+        frames=len(frames),
+        right=int(frames.right.sum()),
+        outside=int(frames.outside.sum()),
+        error_before=calibration_error(before, frames.right, weight),
+        error_after=calibration_error(after, frames.right, weight),
+        accepted=counts[0],
+        accepted_wrong=counts[1],
+        wrong_share_upper=upper_bound(counts[1], counts[0]),
+        outside_accepted=counts[2],
+        outside_share_upper=upper_bound(counts[2], int(frames.outside.sum())),
+    )
+
+
+def log_odds_of(confidence: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the log odds of a calibrated confidence (n,).
+
+    Args:
+        confidence: probabilities between 0 and 1, both excluded (n,).
+    """
+    return np.asarray(np.log(confidence) - np.log1p(-confidence))
+
+
+def weights_of(outside: NDArray[np.bool_]) -> NDArray[np.float64]:
+    """Return the weight of each frame (n,).
+
+    The frames in the map and the out-of-map frames have the same total weight, as in the calibration. The sum of the weights is the
+    effective number of frames (Kish, Survey Sampling, 1965), so a few frames with large weights do not overrule the prior.
+
+    Args:
+        outside: whether each frame is an out-of-map frame (n,).
+    """
+    if outside.all() or not outside.any():
+        return np.ones(len(outside))
+    share = np.where(outside, 0.5 / outside.sum(), 0.5 / (~outside).sum())
+    return np.asarray(share / (share**2).sum())
+
+
+def fit_correction(
+    log_odds: NDArray[np.float64],
+    right: NDArray[np.bool_],
+    weight: NDArray[np.float64],
+    *,
+    lower_only: bool = False,
+    label_noise: float = 0.0,
+) -> tuple[float, float]:
+    """Return the scale and the offset with the largest posterior probability under the prior.
+
+    Args:
+        log_odds: log odds of the calibration (n,).
+        right: labels (n,).
+        weight: weight of each frame (n,).
+        lower_only: the corrected log odds are never larger than the log odds.
+        label_noise: share of wrong labels, 0 to 0.5.
+    """
+
+    def cost(parameters: NDArray[np.float64]) -> float:
+        scale, offset = parameters
+        p = corrected_confidence(log_odds, float(scale), float(offset), lower_only=lower_only)
+        prior = ((scale - 1) / PRIOR_SCALE) ** 2 + (offset / PRIOR_OFFSET_NATS) ** 2
+        return float((weight * _loss(p, right, label_noise)).sum() + 0.5 * prior)
+
+    # The cost has kinks if it may only lower, and one minimum without label noise otherwise. So the search needs no derivatives.
+    starts = sorted(((scale, offset) for scale in _SCALES for offset in _OFFSETS), key=lambda at: cost(np.array(at)))
+    found = [
+        minimize(
+            cost,
+            np.array(start),
+            method="Nelder-Mead",
+            bounds=[(LEAST_SCALE, None), (None, None)],
+            options={"xatol": 1e-7, "fatol": 1e-10, "maxiter": 2000},
+        )
+        for start in [(1.0, 0.0), *starts[:2]]
+    ]
+    best = min(found, key=lambda each: float(each.fun)).x
+    if cost(best) >= cost(np.array([1.0, 0.0])):
+        return 1.0, 0.0
+    return float(best[0]), float(best[1])
+
+
+def corrected_confidence(
+    log_odds: NDArray[np.float64], scale: float, offset: float, *, lower_only: bool
+) -> NDArray[np.float64]:
+    """Return the confidence after a correction, as ``RigCorrection`` computes it (n,).
+
+    Args:
+        log_odds: log odds of the calibration (n,).
+        scale: factor of the log odds.
+        offset: added to the scaled log odds.
+        lower_only: the corrected log odds are never larger than the log odds.
+    """
+    corrected = scale * log_odds + offset
+    return probability(np.minimum(corrected, log_odds) if lower_only else corrected)
+
+
+def calibration_error(
+    confidence: NDArray[np.float64], right: NDArray[np.bool_], weight: NDArray[np.float64], *, bins: int | None = None
+) -> float:
+    """Compute the weighted expected calibration error with bins of equal weight.
+
+    With equal weights it is that of ``model_training.calibration.fit``.
+
+    Args:
+        confidence: confidence of each frame (n,).
+        right: labels (n,).
+        weight: weight of each frame (n,).
+        bins: number of bins; None takes one bin for ``_BIN_FRAMES`` frames, at most ``_BINS``.
+    """
+    bins = min(_BINS, max(1, len(right) // _BIN_FRAMES)) if bins is None else bins
+    order = np.argsort(confidence, kind="stable")
+    share = weight[order] / weight.sum()
+    middle = np.cumsum(share) - share / 2
+    number = np.minimum((middle * bins).astype(int), bins - 1)
+    gap = share * (confidence[order] - right[order])
+    return float(np.abs(np.bincount(number, gap, minlength=bins)).sum())
+
+
+def upper_bound(events: int, trials: int) -> float:
+    """Return the Clopper-Pearson upper bound of a share, one-sided with confidence ``BOUND``; 1 without trials.
+
+    C. Clopper and E. Pearson, The use of confidence or fiducial limits, Biometrika 1934. It assumes independent trials.
+
+    Args:
+        events: number of events.
+        trials: number of trials.
+    """
+    return 1.0 if events >= trials else float(stats.beta.ppf(BOUND, events + 1, trials - events))
+
+
+def support_of(frames: int, rate: float, what: str) -> str | None:
+    """Return a sentence if some frames cannot support a rate, even if no event occurs among them; else None.
+
+    Args:
+        frames: number of frames.
+        rate: the rate to support, 0 to 1.
+        what: name of the frames in the plural.
+    """
+    if frames == 0:
+        return f"there are no {what}, so no rate is supported"
+    least = upper_bound(0, frames)
+    if least <= rate:
+        return None
+    return f"{frames} {what} cannot support a rate of {rate:g}: the least rate they support is {least:.2g}"
+
+
+def report_lines(correction: RigCorrection) -> list[str]:
+    """Return lines of text about a correction and about the claims that its frames support.
+
+    Args:
+        correction: the correction.
+    """
+    c = correction
+    is_none = (c.scale, c.offset) == (1.0, 0.0)
+    formula = f"log odds' = {c.scale:.3f} x log odds {'+' if c.offset >= 0 else '-'} {abs(c.offset):.3f}"
+    may = ", where this lowers the confidence" if c.lower_only and not is_none else ""
+    lines = [
+        f"frames: {c.frames} labelled, {c.right} with a right answer, {c.outside} out-of-map",
+        f"correction: {'none, because none predicts held-out frames better' if is_none else formula}{may}",
+        f"calibration error: {c.error_before:.3f} before, {c.error_after:.3f} after (cross-validated)",
+        f"accepted in the map: {c.accepted}, {c.accepted_wrong} of them wrong; upper bound of the share {c.wrong_share_upper:.2g} (95 %)",
+        f"accepted out-of-map: {c.outside_accepted} of {c.outside}; upper bound of the share {c.outside_share_upper:.2g} (95 %)",
+    ]
+    claims = (
+        support_of(c.accepted, WRONG_RATE, "accepted frames"),
+        support_of(c.outside, FALSE_ACCEPT_RATE, "out-of-map frames"),
+    )
+    return lines + [f"not supported: {claim}" for claim in claims if claim is not None]
+
+
+def with_correction(calibration: Calibration, correction: RigCorrection) -> Calibration:
+    """Return the calibration with a correction for a rig. It replaces an earlier one.
+
+    Args:
+        calibration: calibration of the map.
+        correction: the correction.
+    """
+    return calibration.model_copy(update={"rig": correction})
+
+
+def joined_frames(parts: list[LabelledFrames]) -> LabelledFrames:
+    """Join labelled frames. Frames of different parts share blocks of the same number.
+
+    Args:
+        parts: the frames to join.
+    """
+    names = LabelledFrames.__dataclass_fields__
+    return LabelledFrames(*(np.concatenate([getattr(part, name) for part in parts]) for name in names))
+
+
+def frames_of(
+    evidence: list[NDArray[np.float64] | None],
+    right: NDArray[np.bool_],
+    outside: NDArray[np.bool_],
+    block: NDArray[np.int64],
+) -> LabelledFrames:
+    """Return the labelled frames of some answers. Answers without confidence features are left out.
+
+    Args:
+        evidence: confidence features of each answer; None without registration (n).
+        right: labels (n,).
+        outside: whether each frame is an out-of-map frame (n,).
+        block: block of each frame (n,).
+    """
+    keep = np.array([each is not None for each in evidence], bool)
+    rows = np.array([each for each in evidence if each is not None]).reshape(-1, len(FEATURES))
+    found = LabelledFrames(rows, right[keep] & ~outside[keep], outside[keep], block[keep])
+    finite = np.isfinite(rows).all(axis=1)
+    return found if finite.all() else found.where(finite)
+
+
+def _cross_validated(
+    log_odds: NDArray[np.float64], frames: LabelledFrames, lower_only: bool, label_noise: float
+) -> NDArray[np.float64]:
+    """Return the confidence of each frame by a correction that was fitted on the other blocks (n,)."""
+    found = np.empty(len(frames))
+    for block in np.unique(frames.block):
+        held = frames.block == block
+        rest = frames.where(~held)
+        weight = weights_of(rest.outside)
+        scale, offset = fit_correction(
+            log_odds[~held], rest.right, weight, lower_only=lower_only, label_noise=label_noise
+        )
+        found[held] = corrected_confidence(log_odds[held], scale, offset, lower_only=lower_only)
+    return found
+
+
+def _keeps_rates(calibration: Calibration, before: NDArray[np.float64], after: NDArray[np.float64]) -> bool:
+    """Return whether no threshold lets through more out-of-map frames than its rate, or no more than before the correction."""
+    for each in calibration.thresholds:
+        passed, earlier = (float(np.mean(confidence >= each.confidence)) for confidence in (after, before))
+        if passed > max(each.false_accept_rate, earlier):
+            return False
+    return True
+
+
+def _loss(p: NDArray[np.float64], right: NDArray[np.bool_], label_noise: float) -> NDArray[np.float64]:
+    """Return the negative log likelihood of each label, some of which are wrong."""
+    said = label_noise + (1 - 2 * label_noise) * p
+    return -np.log(np.where(right, said, 1 - said))
+
+
+def _log_loss(
+    p: NDArray[np.float64], right: NDArray[np.bool_], weight: NDArray[np.float64], label_noise: float
+) -> float:
+    return float((weight * _loss(p, right, label_noise)).sum())

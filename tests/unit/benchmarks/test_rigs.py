@@ -1,0 +1,49 @@
+import numpy as np
+import pytest
+
+from benchmarks import rigs
+from benchmarks.report import Report
+from model_training.calibration.fit import Asked, pooled
+from service.confidence.features import FEATURES
+
+COUNT, MARGIN, SHARE = len(FEATURES), FEATURES.index("margin"), FEATURES.index("log_share")
+
+
+def family(name, seed, *, count=1000):
+    """Half of the queries are in the map. All answers to these are right, with unit errors and unit covariances."""
+    rng = np.random.default_rng(seed)
+    known = np.arange(count) % 2 == 0
+    evidence = rng.normal(size=(count, COUNT))
+    evidence[:, MARGIN] += np.where(known, 4.0, -4.0)
+    evidence[:, SHARE] = 0.0
+    error = np.where(known[:, None], 0.1 * rng.normal(size=(count, 6)), np.nan)
+    return Asked(
+        evidence=evidence, right=known, known=known, kind=np.where(known, "clear", "other_city"),
+        family=np.full(count, name), error=error, covariance=np.tile(0.01 * np.eye(6), (count, 1, 1)),
+        heading_rad=np.where(known, 0.5, np.nan),
+    )  # fmt: skip
+
+
+@pytest.fixture
+def rows(monkeypatch, tmp_path, encoder_file):
+    asked = pooled([family("car", 1), family("rings", 2), family("robot", 3)])
+    monkeypatch.setattr(rigs, "collected", lambda *_, **__: asked)
+    report = Report("accuracy", "make evaluate")
+    rigs.rig_rows(report, encoder_file, tmp_path)
+    return {row["id"]: row for row in report.rows}
+
+
+def test_every_family_has_its_rows(rows):
+    for name in ("car", "rings", "robot"):
+        assert rows[f"rigs.{name}.within_1_m"]["value"] == 1.0
+        assert rows[f"rigs.{name}.ece"]["n"] == 1000
+        assert rows[f"rigs.{name}.ece"]["value"] < 0.1
+        assert rows[f"rigs.{name}.covariance_95_coverage"]["value"] == pytest.approx(0.95, abs=0.04)
+        assert rows[f"rigs.{name}.sigma_coverage_gap"]["value"] < 0.1
+
+
+def test_the_worst_family_is_named(rows):
+    """The calibration is not fitted to sparse rings, so they do not count."""
+    worst = max(("car", "robot"), key=lambda name: rows[f"rigs.{name}.ece"]["value"])
+    assert rows["rigs.worst_ece"]["why"] == worst
+    assert rows["rigs.worst_within_1_m"]["why"] in ("car", "robot")

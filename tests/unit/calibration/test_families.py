@@ -1,0 +1,43 @@
+import pytest
+
+from model_training.calibration.families import FAMILIES, FAMILY_CITIES, SEQUENCE, Family, family_plan
+from model_training.simulation.stereo_pair import STEREOS
+
+
+def test_there_are_at_least_twelve_families_with_names_of_their_own():
+    names = {family.name for family in FAMILIES}
+    assert len(names) == len(FAMILIES) >= 12
+
+
+def test_the_families_differ_in_survey_depth_and_height():
+    assert {"vlp_16", "hdl_32", "hdl_64", "os1_64", "os1_128", "pandar_64"} == {family.lidar for family in FAMILIES}
+    assert {1.0, 2.0, 5.0, 10.0} <= {family.spacing_m for family in FAMILIES}
+    heights = [family.camera_height_m for family in FAMILIES]
+    assert min(heights) <= 0.5
+    assert max(heights) >= 2.5
+
+
+@pytest.mark.parametrize("family", FAMILIES, ids=lambda family: family.name)
+def test_each_city_of_a_family_is_a_valid_plan_with_half_a_thousand_queries(family: Family):
+    plans = [family_plan(family, index).checked() for index in range(FAMILY_CITIES)]
+    for plan in plans:
+        traversals = [query.traversal for query in plan.queries]
+        assert len(set(traversals)) == len(traversals)
+        assert 0 not in traversals  # the survey's own
+        expected = family.stereo.focal_baseline_px_m if family.matched else None
+        assert plan.focal_baseline_px_m() == expected
+    assert [plan.queries[-1].sequence for plan in plans] == [None, SEQUENCE]
+    assert len({plan.name for plan in plans}) == FAMILY_CITIES
+    assert sum(query.count * len(query.depths) for plan in plans for query in plan.queries) >= 500
+
+
+@pytest.mark.parametrize("family", FAMILIES, ids=lambda family: family.name)
+def test_walls_and_rooms_have_the_depth_of_the_family(family: Family):
+    """Stereo matchers have no modelled preset, so ``stereo`` stands for them."""
+    model = family.depth_model()
+    if family.matched:
+        assert set(family.depths) <= set(STEREOS)
+        assert model.name == "stereo"
+    else:
+        assert family.depths == (model.name,)
+        assert model.max_range_m == (family.depth.max_range_m or 40.0)
