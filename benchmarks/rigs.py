@@ -13,6 +13,8 @@ from model_training.calibration.make import collected
 from model_training.cli.progress import bars
 from service.maps.calibration import RIGHT_M
 
+#: Queries on the street with repeating blocks. It is a kind of street, not of rig, and half of its places cannot be told apart.
+_REPEATING = "repeating"
 #: Bars of each family, and of the worst one.
 _ECE, _WORST_ECE, _REFUSED, _WRONG, _WITHIN, _WORST_WITHIN, _SIGMA_GAP = 0.05, 0.08, 0.05, 0.01, 0.97, 0.94, 0.05
 
@@ -21,7 +23,7 @@ def rig_rows(report: Report, encoder: Path, work: Path) -> None:
     """Add the rows of all rig families.
 
     The data are those of the calibration. Each family's figures come from a fit without this family. Families that the calibration is not
-    fitted to have rows, but do not count as the worst.
+    fitted to, and the repeating blocks, have rows but do not count as the worst.
 
     Args:
         report: collects the rows.
@@ -44,9 +46,10 @@ def rig_rows(report: Report, encoder: Path, work: Path) -> None:
         if each.outside:
             report.row(f"{row}.outside_accepted", each.outside_accepted, "share", better="lower", n=each.outside)
         coverage_rows(report, row, asked.where(asked.family == each.family))
-    worst = max((each for each in figures if each.family not in NOT_FITTED), key=lambda each: each.ece)
+    counted = [each for each in figures if each.family not in (*NOT_FITTED, _REPEATING)]
+    worst = max(counted, key=lambda each: each.ece)
     report.row("rigs.worst_ece", worst.ece, "share", bar=_WORST_ECE, better="lower", why=worst.family)
-    least = min((each for each in figures if each.family not in NOT_FITTED), key=lambda each: each.within_1_m)
+    least = min(counted, key=lambda each: each.within_1_m)
     report.row("rigs.worst_within_1_m", least.within_1_m, "share", bar=_WORST_WITHIN, why=least.family)
 
 

@@ -157,9 +157,10 @@ def weights_of(asked: Asked) -> NDArray[np.float64]:
 def thresholds_of(asked: Asked, confidence: NDArray[np.float64]) -> tuple[Threshold, ...]:
     """Return for each rate the least confidence at which the false-accept rate is at most this, with ``SURE`` certainty.
 
-    The bound of Clopper and Pearson (Biometrika 1934) covers the finite number of out-of-map queries. Another city, removed streets, walls
-    and rooms have equal weight (decision 0039), so the number of queries is the effective one of Kish (Survey Sampling, 1965). Rates that the data cannot
-    support have no threshold. At the default rate and below it, the threshold is at least ``SAFE_CONFIDENCE``.
+    The bound of Clopper and Pearson (Biometrika 1934) covers the finite number of out-of-map queries. Another city, removed streets,
+    walls and rooms have equal weight (decision 0039), so the number of queries is the effective one of Kish (Survey Sampling, 1965).
+    Rates that the data cannot support have no threshold. At the default rate and below it, the threshold is at least
+    ``SAFE_CONFIDENCE``.
 
     Args:
         asked: the calibration data.
