@@ -36,7 +36,7 @@ class Size:
     @property
     def spacing_m(self) -> float:
         """Distance between the places of the map, metres. With fewer test images than the paper's, the map is sparse too."""
-        return 1.0 if self.test_images is None else 10.0
+        return 1.0 if self.test_images is None else 20.0
 
 
 def made_minutes(folder: Path) -> float:

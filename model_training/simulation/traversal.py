@@ -62,21 +62,18 @@ def stations_along(streets: Iterable[Street], step_m: float, *, lane_m: float = 
     for street in streets:
         for line in street.lines:
             along = np.r_[0.0, np.cumsum(np.linalg.norm(np.diff(line, axis=0), axis=1))]
+            u = np.arange(0.0, along[-1], step_m)
 
             def at(
-                u: float, line: NDArray[np.float64] = line, along: NDArray[np.float64] = along
+                u: NDArray[np.float64], line: NDArray[np.float64] = line, along: NDArray[np.float64] = along
             ) -> NDArray[np.float64]:
-                return np.array([np.interp(u, along, line[:, 0]), np.interp(u, along, line[:, 1])])
+                return np.column_stack([np.interp(u, along, line[:, 0]), np.interp(u, along, line[:, 1])])
 
-            for u in np.arange(0.0, along[-1], step_m):
-                ahead, behind = at(min(u + 1.5, along[-1])), at(max(u - 1.5, 0.0))
-                direction = (ahead - behind) / np.linalg.norm(ahead - behind)
-                point = at(u) + lane_m * np.array([direction[1], -direction[0]])
-                found.append(
-                    Station(
-                        float(point[0]), float(point[1]), float(np.arctan2(direction[1], direction[0])), travelled + u
-                    )
-                )
+            direction = at(np.minimum(u + 1.5, along[-1])) - at(np.maximum(u - 1.5, 0.0))
+            direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+            points = at(u) + lane_m * np.column_stack([direction[:, 1], -direction[:, 0]])
+            headings = np.arctan2(direction[:, 1], direction[:, 0])
+            found += [Station(*row) for row in np.column_stack([points, headings, travelled + u]).tolist()]
             travelled += float(along[-1])
     return found
 

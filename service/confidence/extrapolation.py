@@ -4,6 +4,7 @@ import numpy as np
 from jaxtyping import Float64
 from numpy.typing import NDArray
 
+from service.confidence.features import IDEALS
 from service.maps.calibration import Calibration
 
 #: Width of the margin beyond the knots of a term, as a share of the distance between the first and the last.
@@ -16,7 +17,8 @@ def extrapolated(
     """Return the features that the confidence uses and that lie outside the range of the calibration data.
 
     The confidence does not follow a feature beyond the first and the last knot of its term. The range is wider by ``MARGIN`` of the
-    distance between them on either side, because a few of the calibration's own queries lie just outside.
+    distance between the knots, because a few of the calibration's own queries lie just outside. A feature with an ideal, such as no
+    distance to the nearest place, has no end on that side: the answer gets no more credit there than the best calibration data.
 
     Args:
         calibration: calibration of the map.
@@ -32,6 +34,9 @@ def extrapolated(
     for term in calibration.right.terms:
         column = calibration.names.index(term.feature)
         margin = MARGIN * (term.knots[-1] - term.knots[0])
-        if not term.knots[0] - margin <= evidence[column] <= term.knots[-1] + margin:
+        ideal = IDEALS.get(term.feature, 0)
+        below = ideal >= 0 and evidence[column] < term.knots[0] - margin
+        above = ideal <= 0 and evidence[column] > term.knots[-1] + margin
+        if below or above:
             outside.append((term.feature, float(away[column])))
     return tuple(sorted(outside, key=lambda each: (-abs(each[1]), each[0])))

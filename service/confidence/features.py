@@ -119,6 +119,7 @@ class Feature:
         of: computes the value.
         rivalry: whether it compares competing candidates. The probability that a query is in the map does not use these.
         weighted: whether the confidence uses it.
+        ideal: whether it has an ideal value on the side that speaks for a right answer, such as a distance or an error of 0.
     """
 
     name: str
@@ -128,6 +129,7 @@ class Feature:
     of: Callable[[Evidence], float]
     rivalry: bool = False
     weighted: bool = True
+    ideal: bool = False
 
 
 #: All confidence features, in the order of the calibration file.
@@ -138,40 +140,40 @@ class Feature:
 #: were left out of the fit (decision 0149). They still serve ``reasons``.
 TABLE: tuple[Feature, ...] = (
     Feature("margin", "nat", "support gap to the best rival", 1,
-            lambda e: float(e.support_gaps[1:].min(initial=_MOST_MARGIN)), rivalry=True),
+            lambda e: float(e.support_gaps[1:].min(initial=_MOST_MARGIN)), rivalry=True, ideal=True),
     Feature("inliers", "1", "share of the points that lie on the map", 1, lambda e: e.best.registered.inliers, weighted=False),
     Feature("mapped_inliers", "1", "the same, relative to the share where the map shows a surface", 1,
-            lambda e: e.best.registered.inliers / e.mapped_share),
+            lambda e: e.best.registered.inliers / e.mapped_share, ideal=True),
     Feature("similarity", "1", "descriptor similarity to the places around the pose", 1,
             lambda e: e.best.scores["similarity"], weighted=False),
     Feature("similarity_margin", "1", "similarity at the pose minus the best similarity elsewhere", 1,
-            lambda e: e.similarity_margin, rivalry=True),
+            lambda e: e.similarity_margin, rivalry=True, ideal=True),
     Feature("likelihood", "nat", "mean log likelihood of the rendered depth", 1, lambda e: e.best.scores["likelihood"],
             weighted=False),
     Feature("through", "1", "share of the mapped points behind the map's surfaces", -1,
-            lambda e: e.best.scores["through"] / e.mapped_share),
+            lambda e: e.best.scores["through"] / e.mapped_share, ideal=True),
     Feature("front", "1", "share of the mapped points in front of the map's surfaces", -1,
-            lambda e: e.best.scores["front"] / e.mapped_share),
+            lambda e: e.best.scores["front"] / e.mapped_share, ideal=True),
     Feature("unmapped", "1", "share of the points where the map shows nothing", -1, lambda e: e.best.scores["unmapped"],
             weighted=False),
     Feature("log_sigma", "log m", "larger horizontal standard deviation of the registration", -1,
             lambda e: float(np.log(float(np.sqrt(np.linalg.eigvalsh(e.refined.registration_covariance[:2, :2])[-1]))))),
     Feature("scale", "1 %", "estimated scale error of the depth, unsigned", -1,
-            lambda e: abs(float(np.log(e.best.registered.scale))) / 0.01),
+            lambda e: abs(float(np.log(e.best.registered.scale))) / 0.01, ideal=True),
     Feature("votes", "1", "neighbours within 5 m of the pose, as a share of the places there", 1,
             lambda e: e.votes, rivalry=True, weighted=False),
-    Feature("entropy", "nat", "entropy of the clusters' weights", -1, lambda e: e.entropy, rivalry=True),
+    Feature("entropy", "nat", "entropy of the clusters' weights", -1, lambda e: e.entropy, rivalry=True, ideal=True),
     Feature("log_noise", "log 1/m", "standard deviation of the inverse depth of one pixel", -1,
             lambda e: float(np.log(np.median([frame.noise for frame in e.frames])))),
     Feature("points", "3000", "points of a frame", 1, lambda e: e.refined.points / 3000.0 / len(e.frames)),
     Feature("measured", "1", "share of the view grid with a measurement", 1, lambda e: e.frames[0].views.measured_share),
     Feature("place_m", "m", "distance of the places around the pose, at most 10 m", -1,
-            lambda e: min(e.best.scores["place_m"], _MOST_PLACE_M)),
+            lambda e: min(e.best.scores["place_m"], _MOST_PLACE_M), ideal=True),
     Feature("facings", "log 1", "variety of the directions that walls face", 1, lambda e: e.shape.facings),
     Feature("far", "log m", "median range above the horizon", 0, lambda e: e.shape.far),
     Feature("edges", "1", "share of neighbouring cells on different surfaces", 0, lambda e: e.shape.edges),
     Feature("residual", "log 1", "disagreement of the image's patches about the pose, relative to their noise", -1,
-            lambda e: float(np.log(e.refined.disagreement))),
+            lambda e: float(np.log(e.refined.disagreement)), ideal=True),
     Feature("pose_spread", "log m", "distance of the first five neighbours from their mean", -1,
             lambda e: e.pose_spread, rivalry=True, weighted=False),
     Feature("log_share", "log 1", "share of the best candidate in the support of all candidates that exclude each other", 1,
@@ -182,6 +184,8 @@ TABLE: tuple[Feature, ...] = (
 FEATURES = tuple(feature.name for feature in TABLE)
 #: Names of the features that compare competing candidates.
 RIVALRY = tuple(feature.name for feature in TABLE if feature.rivalry)
+#: Sign of each feature that has an ideal value.
+IDEALS: dict[str, int] = {feature.name: feature.sign for feature in TABLE if feature.ideal}
 #: Names of the features that the confidence does not use.
 UNWEIGHED = tuple(feature.name for feature in TABLE if not feature.weighted)
 

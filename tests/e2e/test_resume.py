@@ -36,10 +36,10 @@ work._write = kept
 
 @pytest.fixture(scope="module")
 def dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Some 150 scans without queries: two chunks of places and a part of one."""
+    """Some 90 scans without queries: a chunk of places and a part of one."""
     out = tmp_path_factory.mktemp("resume") / "town"
     plan = SimulationPlan(
-        name="town", seed=3, size_m=(60.0, 60.0), spacing_m=0.5, streets=("1",), lidar="vlp_16", queries=()
+        name="town", seed=3, size_m=(60.0, 60.0), spacing_m=0.8, streets=("1",), lidar="vlp_16", queries=()
     )
     simulate(plan, out, workers=1)
     return out
@@ -49,28 +49,36 @@ def dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def options(encoder_of: Callable[..., bytes], tmp_path_factory: pytest.TempPathFactory) -> tuple[str, ...]:
     path = tmp_path_factory.mktemp("encoders") / "encoder.onnx"
     path.write_bytes(encoder_of())
-    return ("--encoder", str(path), "--spacing", "0.5", "--headings", "6")
+    return ("--encoder", str(path), "--spacing", "0.8", "--headings", "6")
 
 
-def test_killed_builds_end_with_the_bytes_of_an_undisturbed_one(
-    dataset: Path, options: tuple[str, ...], tmp_path: Path
+@pytest.fixture(scope="module")
+def killed(
+    dataset: Path, options: tuple[str, ...], tmp_path_factory: pytest.TempPathFactory
+) -> tuple[tuple[int, ...], Path]:
+    """Return which of two killed builds ended as the undisturbed one, and the bundle of the undisturbed one."""
+    work = tmp_path_factory.mktemp("killed") / "builds"
+    return identical_bundles(dataset, work, builds=2, seed=1, options=options), work / "undisturbed"
+
+
+def test_killed_builds_end_with_the_bytes_of_an_undisturbed_one(killed: tuple[tuple[int, ...], Path]) -> None:
+    assert killed[0] == (1, 1)
+
+
+def test_a_build_interrupted_from_the_keyboard_goes_on(
+    dataset: Path, options: tuple[str, ...], killed: tuple[tuple[int, ...], Path], tmp_path: Path
 ) -> None:
-    assert identical_bundles(dataset, tmp_path / "builds", builds=2, seed=1, options=options) == (1, 1)
-
-
-def test_a_build_interrupted_from_the_keyboard_goes_on(dataset: Path, options: tuple[str, ...], tmp_path: Path) -> None:
     """Interrupted when its first part is finished; the part is still there, and nothing under the bundle's name."""
     out, parts = tmp_path / "m", tmp_path / ".m.building"
 
-    def build(to: Path, program: str = BUILD) -> int:
-        command = [sys.executable, "-c", program, "build-map", str(dataset), "--out", str(to), *options]
-        return subprocess.run(command, capture_output=True, timeout=300, check=False).returncode
+    def build(program: str = BUILD) -> int:
+        command = [sys.executable, "-c", program, "build-map", str(dataset), "--out", str(out), "--name", "resumed"]
+        return subprocess.run([*command, *options], capture_output=True, timeout=300, check=False).returncode
 
-    assert build(out, INTERRUPTED) == 130
+    assert build(INTERRUPTED) == 130
     assert len(list(parts.glob("places-*.npz"))) == 1
     assert not out.exists()
-    assert build(out) == 0
+    assert build() == 0
     assert MapBundle.open(out).manifest.counts.places > 64
     assert not parts.exists()
-    assert build(tmp_path / "undisturbed") == 0
-    assert content_of(out) == content_of(tmp_path / "undisturbed")
+    assert content_of(out) == content_of(killed[1])

@@ -13,6 +13,8 @@ TRAINING_SETS = ("own_drive_precise", "second_drive_precise")
 SPLITS = ("same_drive", "other_drive")
 #: Spacing of the survey's scans at the paper's size, metres.
 DENSEST_M = 0.5
+#: Largest spacing of the survey's scans, metres: with all test images, and in a reduced run, whose map is sparse.
+SPARSEST_M, SPARSEST_REDUCED_M = 4.0, 10.0
 #: Traversals of the tests and of the second training set. Nothing else in the project uses these numbers in this city.
 TEST_TRAVERSAL, TRAINING_TRAVERSAL = 6, 20
 
@@ -36,5 +38,6 @@ def pairs_plan(pairs: int, *, test_images: int | None = None) -> SimulationPlan:
         test("other_drive", TEST_TRAVERSAL, on_track=False),
     )
     # The survey needs as many stations as its own pairs, and a margin for blocked stations.
-    spacing_m = min(4.0, DENSEST_M * (PAPER_PAIRS // 2) / max(1, pairs // 2))
+    most_m = SPARSEST_M if test_images is None else SPARSEST_REDUCED_M
+    spacing_m = min(most_m, DENSEST_M * (PAPER_PAIRS // 2) / max(1, pairs // 2))
     return SimulationPlan(name="paper-comparison", city="paper", seed=0, spacing_m=spacing_m, queries=queries)

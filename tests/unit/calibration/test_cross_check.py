@@ -50,7 +50,7 @@ def test_the_status_needs_the_threshold_the_majority_and_a_query_in_range():
     four = asked.where(np.arange(len(asked)) < 4)
     four.evidence[:] = 0.0
     four.evidence[:, SHARE] = np.log([0.9, 0.4, 0.9, 0.9])
-    four.evidence[3, MARGIN] = 1e6
+    four.evidence[3, FEATURES.index("points")] = 1e6
     confident = calibration.model_copy(
         update={"right": calibration.right.model_copy(update={"bias": 50.0}), "thresholds": calibration.thresholds}
     )

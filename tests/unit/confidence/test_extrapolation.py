@@ -40,31 +40,41 @@ def evidence_of(**deviations):
 
 
 def test_features_beyond_the_range_are_named_the_farthest_first(calibration_with):
-    calibration = calibration_with("front", "points", "inliers")
-    found = extrapolated(calibration, evidence_of(front=5.0, points=-7.0, inliers=END))
-    assert found == (("points", -7.0), ("front", 5.0))
+    calibration = calibration_with("far", "points", "edges")
+    found = extrapolated(calibration, evidence_of(far=5.0, points=-7.0, edges=END))
+    assert found == (("points", -7.0), ("far", 5.0))
+
+
+@pytest.mark.parametrize(
+    ("name", "below", "above"), [("place_m", False, True), ("mapped_inliers", True, False), ("points", True, True)]
+)
+def test_a_feature_with_an_ideal_has_no_end_there(calibration_with, name, below, above):
+    """No place is too near, and no share of inliers is too large. A number of points has no ideal."""
+    calibration = calibration_with(name)
+    assert bool(extrapolated(calibration, evidence_of(**{name: -6.0}))) is below
+    assert bool(extrapolated(calibration, evidence_of(**{name: 6.0}))) is above
 
 
 def test_a_feature_without_a_term_does_not_count(calibration_with):
-    assert extrapolated(calibration_with("front"), evidence_of(points=5.0)) == ()
+    assert extrapolated(calibration_with("far"), evidence_of(points=5.0)) == ()
 
 
 def test_without_registration_nothing_is_extrapolated(calibration_with):
-    assert extrapolated(calibration_with("front"), None) == ()
+    assert extrapolated(calibration_with("far"), None) == ()
 
 
 @given(st.floats(END * (1 + 2 * MARGIN) + 1e-6, 1e6), st.sampled_from([-1.0, 1.0]))
 def test_beyond_the_range_the_confidence_no_longer_follows_the_feature(calibration_with, size, sign):
-    calibration = calibration_with("front", "points")
-    inside, outside = (calibration.log_odds("right", evidence_of(front=sign * at, points=1.0)) for at in (END, size))
+    calibration = calibration_with("far", "points")
+    inside, outside = (calibration.log_odds("right", evidence_of(far=sign * at, points=1.0)) for at in (END, size))
     assert outside == pytest.approx(inside)
-    assert extrapolated(calibration, evidence_of(front=sign * size, points=1.0)) != ()
+    assert extrapolated(calibration, evidence_of(far=sign * size, points=1.0)) != ()
 
 
 @pytest.mark.parametrize(("size", "outside"), [(4.79, False), (4.81, True), (-4.79, False), (-4.81, True)])
 def test_the_range_is_a_tenth_wider_than_the_knots(calibration_with, size, outside):
     """The knots are 8 standard deviations apart, so the range ends 0.8 beyond them."""
-    assert bool(extrapolated(calibration_with("front"), evidence_of(front=size))) is outside
+    assert bool(extrapolated(calibration_with("far"), evidence_of(far=size))) is outside
 
 
 @pytest.mark.parametrize(
@@ -77,10 +87,8 @@ def test_an_extrapolated_answer_is_localized_only_at_a_higher_rate_than_the_defa
     image = np.ones((4, 4), np.float32)
     camera = PinholeCamera(4, 4, 4.0, 4.0, 1.5, 1.5)
     query = Query(rgb=np.zeros((4, 4, 3), np.uint8), depth_m=image, camera=camera, false_accept_rate=rate)
-    calibration = calibration_with("front", bias=bias)
-    found = outcome_of(
-        calibration, query, None, evidence_of(front=5.0), frames=1, extent=Extent(np.zeros(3), np.eye(3))
-    )
-    assert found.extrapolated == (("front", 5.0),)
+    calibration = calibration_with("far", bias=bias)
+    found = outcome_of(calibration, query, None, evidence_of(far=5.0), frames=1, extent=Extent(np.zeros(3), np.eye(3)))
+    assert found.extrapolated == (("far", 5.0),)
     assert found.threshold == calibration.threshold_at(rate)
     assert found.status == status
