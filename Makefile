@@ -49,6 +49,9 @@ demo-real: .venv/.mapping ## the same with real stereo frames: make demo-real DA
 
 # A file's tests stay in one process, whose fixtures they share. Files keep their order: the longest test, of one file, comes early.
 TEST_PROCESSES = --numprocesses auto --maxprocesses 4 --dist loadfile --no-loadscope-reorder
+# There is a test process for each core. Further threads of OpenBLAS and torch would wait for each other.
+test test-service: export OMP_NUM_THREADS := 1
+test test-service: export OPENBLAS_NUM_THREADS := 1
 
 test: .venv/.torch ## all tests, in a process for each core
 	$(BIN)/python -m pytest $(TEST_PROCESSES) $(ARGS)

@@ -252,3 +252,112 @@ WHY_MISSED: dict[str, Reason] = {
         "confidence features in one table. 20 files would have 440 lines each, with several subjects per file",
     ),
 }
+
+WHY_MISSED["real.kitti_0005.answered_within_1_m"] = Reason(
+    0.8846154,
+    "All 26 answers are right. Three have a confidence of 0.76 to 0.89, and the default needs 0.9. A false-accept rate of 0.02 "
+    "accepts all (decision 0149). In these three, vehicles cover much of the image",
+)
+#: Why rows ``rigs.FAMILY.*`` miss their bars, by the last part of the id.
+_RIGS = {
+    "ece": (
+        "The family lies outside the range of the others, and almost none of its answers is LOCALIZED (decision 0149). Monocular depth "
+        "has a scale error of 8 %, which no other family has. Half of the places between repeating blocks cannot be told apart"
+    ),
+    "within_1_m": (
+        "Most of the wrong answers are in another place. Cameras of small robots see little: depth ends at 5 to 12 m, or the baseline is "
+        "too small for the depth beyond 10 m. The encoder was trained with cameras at 1.2 to 1.9 m and without these rigs. Five frames "
+        "find nearly all places of the cars and the robot (0.95 to 1.00). Next: these rigs and heights in the training"
+    ),
+    "right_but_refused": (
+        "A LOCALIZED answer needs a confidence of 0.9, with every second query from outside the map. A rate of 0.02 accepts most of "
+        "these answers. ZED 2 is refused because its noise lies outside the range of the other families. Tried: 12 sets of features, "
+        "products, brightness (decision 0149). Next: better retrieval for these rigs"
+    ),
+    "wrong_of_localized": (
+        "Without this family the fit knows no scale error of 8 % (monocular), or no survey with a scan every 5 or 10 m in suburbs. "
+        "The wrong answers of the other two are 4 of 338 and 8 of 468"
+    ),
+    "covariance_95_coverage": (
+        "The data were collected before decision 0151. Height, roll and pitch lacked the errors of the survey and of the stereo pair"
+    ),
+    "sigma_coverage_gap": (
+        "The data were collected before decision 0151. Height, roll and pitch lacked the errors of the survey and of the stereo pair"
+    ),
+    "worst_within_1_m": (
+        "ZED 2 with semi-global matching: at 31 px m an error of 0.25 px is 0.8 m at 10 m. Five frames find 18 of 20 places"
+    ),
+}  # fmt: skip
+#: Values of these rows.
+_RIG_VALUES = {
+    "rigs.car.within_1_m": 0.908,
+    "rigs.car.right_but_refused": 0.25,
+    "rigs.car.covariance_95_coverage": 0.2687225,
+    "rigs.car.sigma_coverage_gap": 0.4407841,
+    "rigs.car_sparse.within_1_m": 0.922,
+    "rigs.car_sparse.right_but_refused": 0.254,
+    "rigs.car_sparse.wrong_of_localized": 0.01183432,
+    "rigs.car_sparse.covariance_95_coverage": 0.4630435,
+    "rigs.car_sparse.sigma_coverage_gap": 0.2612609,
+    "rigs.d435.ece": 0.110473,
+    "rigs.d435.within_1_m": 0.456,
+    "rigs.d435.right_but_refused": 0.42,
+    "rigs.d435.covariance_95_coverage": 0.6666667,
+    "rigs.d435.sigma_coverage_gap": 0.1435263,
+    "rigs.d455.within_1_m": 0.966,
+    "rigs.d455.right_but_refused": 0.114,
+    "rigs.d455.covariance_95_coverage": 0.8136646,
+    "rigs.d455.sigma_coverage_gap": 0.09546791,
+    "rigs.every_10_m.wrong_of_localized": 0.01709402,
+    "rigs.every_10_m.covariance_95_coverage": 0.4907216,
+    "rigs.every_10_m.sigma_coverage_gap": 0.4096701,
+    "rigs.kinect.ece": 0.05195133,
+    "rigs.kinect.within_1_m": 0.088,
+    "rigs.kinect.right_but_refused": 0.088,
+    "rigs.kinect.covariance_95_coverage": 0.5909091,
+    "rigs.kinect.sigma_coverage_gap": 0.2494545,
+    "rigs.lorry.within_1_m": 0.93,
+    "rigs.lorry.right_but_refused": 0.082,
+    "rigs.lorry.covariance_95_coverage": 0.316129,
+    "rigs.lorry.sigma_coverage_gap": 0.3862581,
+    "rigs.monocular.ece": 0.0746983,
+    "rigs.monocular.within_1_m": 0.746,
+    "rigs.monocular.right_but_refused": 0.418,
+    "rigs.monocular.wrong_of_localized": 0.04651163,
+    "rigs.monocular.covariance_95_coverage": 0.233244,
+    "rigs.monocular.sigma_coverage_gap": 0.5867078,
+    "rigs.narrow.right_but_refused": 0.0875,
+    "rigs.narrow.covariance_95_coverage": 0.8453608,
+    "rigs.narrow.sigma_coverage_gap": 0.1224124,
+    "rigs.oak_d.within_1_m": 0.034,
+    "rigs.oak_d.covariance_95_coverage": 0.2941176,
+    "rigs.oak_d.sigma_coverage_gap": 0.2712353,
+    "rigs.precise.within_1_m": 0.9392831,
+    "rigs.precise.covariance_95_coverage": 0.8325545,
+    "rigs.precise.sigma_coverage_gap": 0.09659502,
+    "rigs.repeating.ece": 0.2877608,
+    "rigs.repeating.within_1_m": 0.485,
+    "rigs.repeating.right_but_refused": 0.17,
+    "rigs.repeating.covariance_95_coverage": 0.5103093,
+    "rigs.repeating.sigma_coverage_gap": 0.1241031,
+    "rigs.rings.ece": 0.075,
+    "rigs.rings.within_1_m": 0.162,
+    "rigs.rings.right_but_refused": 0.162,
+    "rigs.robot.within_1_m": 0.7942308,
+    "rigs.robot.right_but_refused": 0.35,
+    "rigs.robot.covariance_95_coverage": 0.6174334,
+    "rigs.robot.sigma_coverage_gap": 0.2665351,
+    "rigs.stereo.within_1_m": 0.9012436,
+    "rigs.stereo.right_but_refused": 0.08997805,
+    "rigs.stereo.covariance_95_coverage": 0.7930195,
+    "rigs.stereo.sigma_coverage_gap": 0.1197597,
+    "rigs.vlp_16.right_but_refused": 0.052,
+    "rigs.vlp_16.covariance_95_coverage": 0.8217213,
+    "rigs.vlp_16.sigma_coverage_gap": 0.067,
+    "rigs.zed2.within_1_m": 0.584,
+    "rigs.zed2.right_but_refused": 0.584,
+    "rigs.zed2.covariance_95_coverage": 0.3127148,
+    "rigs.zed2.sigma_coverage_gap": 0.3221753,
+    "rigs.worst_within_1_m": 0.584,
+}
+WHY_MISSED |= {row: Reason(value, _RIGS[row.rsplit(".", maxsplit=1)[1]]) for row, value in _RIG_VALUES.items()}

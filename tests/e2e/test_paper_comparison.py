@@ -9,7 +9,7 @@ METHODS = ("streetfix", "scan_context", "dual", "regression", "cnn_one_space_bot
 
 
 def test_a_little_of_everything_runs_and_goes_on_where_it_was(tmp_path: Path) -> None:
-    size = ("--frames", "160", "--pairs", "80", "--test-images", "8", "--budget-minutes", "0.02")
+    size = ("--frames", "96", "--pairs", "64", "--test-images", "6", "--budget-minutes", "0.02")
     command = [
         sys.executable,
         "-m",

@@ -14,7 +14,7 @@ SPLITS = ("same_drive", "other_drive")
 #: Spacing of the survey's scans at the paper's size, metres.
 DENSEST_M = 0.5
 #: Largest spacing of the survey's scans, metres: with all test images, and in a reduced run, whose map is sparse.
-SPARSEST_M, SPARSEST_REDUCED_M = 4.0, 10.0
+SPARSEST_M, SPARSEST_REDUCED_M = 4.0, 20.0
 #: Traversals of the tests and of the second training set. Nothing else in the project uses these numbers in this city.
 TEST_TRAVERSAL, TRAINING_TRAVERSAL = 6, 20
 
