@@ -80,7 +80,7 @@ def command(
 ) -> None:
     """Fit the confidence of an encoder on calibration cities, or correct the confidence of a map for a rig.
 
-    The first simulates the cities, which takes about half an hour. The second takes seconds to minutes.
+    The first simulates the cities, which takes about two hours. The second takes seconds to minutes.
 
     \b
     Examples:

@@ -246,10 +246,11 @@ def test_the_threshold_is_that_of_the_largest_rate_not_above_the_requested_one(c
     assert calibration_of(thresholds=thresholds).threshold(rate) == confidence
 
 
-def test_every_feature_has_a_name_of_its_own_and_those_of_rivalry_and_the_unweighed_are_among_them():
+def test_every_feature_has_a_name_of_its_own_and_the_groups_name_features():
     assert len(set(FEATURES)) == COUNT
     assert set(RIVALRY) < set(FEATURES)
-    assert set(UNWEIGHED) < set(FEATURES) - set(RIVALRY)
+    assert set(UNWEIGHED) < set(FEATURES)
+    assert set(RIVALRY) - set(UNWEIGHED)
 
 
 def test_a_calibration_cannot_be_changed(calibration_of):
