@@ -13,6 +13,8 @@ from typing import Any
 import numpy as np
 import pytest
 
+from service.cli.main import main
+
 COMMAND = [sys.executable, "-c", "from service.cli.main import main; main()"]
 Parts = Callable[..., dict[str, bytes]]
 
@@ -117,7 +119,10 @@ def test_a_curve_is_drawn(service: dict[str, Any], dataset: Path, tmp_path: Path
     assert picture.read_bytes().startswith(b"\x89PNG")
 
 
-def test_what_cannot_be_done_is_said(service: dict[str, Any], dataset: Path, tmp_path: Path) -> None:
+def test_what_cannot_be_done_is_said(
+    service: dict[str, Any], dataset: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The command refuses these before it sends a request, so they need no process of their own."""
     url = ("--url", service["url"])
     for arguments, told in (
         ((*url, "--dataset", str(tmp_path)), "dataset.json"),
@@ -125,9 +130,15 @@ def test_what_cannot_be_done_is_said(service: dict[str, Any], dataset: Path, tmp
         ((*url, "--dataset", str(dataset), "--rate", "1", "--concurrency", "1"), "give one of them"),
         ((*url, "--dataset", str(dataset), "--rate", "0"), "must be positive"),
         ((*url, "--dataset", str(dataset), "--pid", "4194303"), "process not found"),
-        (("--url", "http://127.0.0.1:9", "--dataset", str(dataset)), "no request was answered"),
     ):
-        done = load(*arguments)
-        assert done.returncode == 1, done.stdout
-        assert told in done.stderr
-        assert "Traceback" not in done.stderr
+        with pytest.raises(SystemExit) as end:
+            main(["loadtest", *arguments])
+        assert end.value.code == 1
+        assert told in capsys.readouterr().err
+
+
+def test_a_service_that_answers_nothing_is_an_error(dataset: Path) -> None:
+    done = load("--url", "http://127.0.0.1:9", "--dataset", str(dataset))
+    assert done.returncode == 1, done.stdout
+    assert "no request was answered" in done.stderr
+    assert "Traceback" not in done.stderr
