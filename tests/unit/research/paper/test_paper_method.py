@@ -162,7 +162,7 @@ def test_unmeasured_cells_are_black_in_both_kinds() -> None:
 
 
 def test_the_cnn_learns_to_separate_the_classes_and_stops(tmp_path: Path) -> None:
-    frames = frames_of(160)
+    frames = frames_of(96)
     trainer = CnnTrainer(CnnPlan("aligned", batch=16), frames, None, tmp_path, budget_s=60.0, patience=12)
 
     net = trainer.run("test")
