@@ -20,7 +20,7 @@ from model_training.training.recipe import CALIBRATION_SEEDS
 FAMILY_CITIES = 2
 #: Number of frames in a sequence.
 SEQUENCE = 5
-#: Index of the seed of the first family in ``CALIBRATION_SEEDS``.
+#: Index of the seed of the first family in ``CALIBRATION_SEEDS``. A new family goes to the end of ``FAMILIES``, or the seeds move.
 _FIRST = 100
 #: Exposure above the metered one in the traversals in hard light, stops. Sunlit roads clip there, and stereo matching fails without
 #: texture. On KITTI drive 0005 half of the outliers without texture lie in such pixels (decision 0138).

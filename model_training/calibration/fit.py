@@ -1,5 +1,6 @@
 """Fit a ``Calibration``: an additive model of the confidence, and thresholds from the out-of-map queries."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -9,11 +10,13 @@ from scipy.stats import beta
 from model_training.calibration.additive import Penalty, fit_additive
 from service.confidence.features import FEATURES, TABLE, Feature
 from service.errors import DatasetError
-from service.maps.calibration import Calibration, FeatureStatistics, Threshold
+from service.maps.calibration import Calibration, FeatureStatistics, Threshold, probability
 from service.option_limits import FALSE_ACCEPT_RATE, SAFE_CONFIDENCE
 
 #: False-accept rates with a threshold.
 RATES = (0.001, 0.002, 0.003, 0.005, 0.01, 0.02, 0.03, 0.05, 0.1)
+#: Number of groups of rig families for the thresholds. Each group is predicted by a fit to the others.
+FOLDS = 5
 #: Kinds of out-of-map queries.
 OUT_OF_MAP = ("other_city", "removed_streets", "wall", "room")
 #: Certainty of the upper bound of a false-accept rate.
@@ -109,21 +112,40 @@ def fit(
             "calibration needs right and wrong answers, and queries in the map and outside it; send "
             "more queries", field="queries"
         )  # fmt: skip
-    weight = weights_of(used)
-    weighted = tuple(feature for feature in features if feature.weighted)
-    penalty = Penalty(ridge, smooth)
-    right = fit_additive(used.evidence, used.right, weight, weighted, penalty)
+    weighted, penalty = tuple(feature for feature in features if feature.weighted), Penalty(ridge, smooth)
     alone = tuple(feature for feature in weighted if not feature.rivalry)
-    known = fit_additive(used.evidence, used.known, weight, alone, penalty)
     mean, std = used.evidence.mean(axis=0), used.evidence.std(axis=0) + 1e-9
-    statistics = tuple(
-        FeatureStatistics(name=name, mean=float(mean[k]), std=float(std[k])) for k, name in enumerate(FEATURES)
+    return Calibration(
+        features=tuple(
+            FeatureStatistics(name=name, mean=float(mean[k]), std=float(std[k])) for k, name in enumerate(FEATURES)
+        ),
+        right=fit_additive(used.evidence, used.right, weights_of(used), weighted, penalty),
+        known=fit_additive(used.evidence, used.known, weights_of(used), alone, penalty),
+        thresholds=thresholds_of(asked, held_out_confidences(asked, weighted, penalty)),
+        measured_on=measured_on | {"queries": len(asked)},
     )
-    flat = Threshold(false_accept_rate=0.5, confidence=1.0)  # replaced below: the thresholds need the models
-    found = Calibration(
-        features=statistics, right=right, known=known, thresholds=(flat,), measured_on=measured_on | {"queries": len(asked)}
-    )  # fmt: skip
-    return found.model_copy(update={"thresholds": thresholds_of(asked, confidences(found, asked))})
+
+
+def held_out_confidences(asked: Asked, features: Sequence[Feature], penalty: Penalty) -> NDArray[np.float64]:
+    """Compute the confidence of every row (n,) by a model that was fitted to other rig families; 0 without registration.
+
+    A bound on the false-accept rate needs queries that the model has not seen. With a single family, the model has not seen the row.
+
+    Args:
+        asked: the calibration data.
+        features: the features that the model may use.
+        penalty: penalties on the terms.
+    """
+    families, number = np.unique(asked.family, return_inverse=True)
+    fold = (number if len(families) > 1 else np.arange(len(asked))) % FOLDS
+    has = np.isfinite(asked.evidence).all(axis=1)
+    found = np.zeros(len(asked))
+    for k in np.unique(fold):
+        own, others = has & (fold == k), asked.where(has & (fold != k))
+        if own.any():
+            model = fit_additive(others.evidence, others.right, weights_of(others), features, penalty)
+            found[own] = probability(model.log_odds(asked.evidence[own], FEATURES))
+    return found
 
 
 def confidences(calibration: Calibration, asked: Asked) -> NDArray[np.float64]:

@@ -57,6 +57,7 @@ def calibrate(
         + "".join(
             f", {family.name} of seed {family_plan(family, k).seed}"
             for family in FAMILIES
+            if family.fitted
             for k in range(FAMILY_CITIES)
         ),
         "encoder_sha256": sha256,

@@ -1,6 +1,7 @@
 """``calibration.json``: maps the confidence features of an answer to the probability that its position is right."""
 
 import json
+from collections.abc import Sequence
 from itertools import pairwise
 from typing import ClassVar, Literal
 
@@ -62,6 +63,20 @@ class AdditiveModel(_Frozen):
         if len(set(names)) != len(names):
             raise ValueError("terms: a feature has two terms")
         return self
+
+    def log_odds(
+        self, evidence: Float64[NDArray[np.float64], "*n F"], names: Sequence[str]
+    ) -> Float64[NDArray[np.float64], "*n"]:
+        """Return the log odds for one or more rows of features.
+
+        Args:
+            evidence: confidence features.
+            names: names of the features in their order.
+        """
+        odds = np.full(evidence.shape[:-1], self.bias)
+        for term in self.terms:
+            odds = odds + np.interp(evidence[..., names.index(term.feature)], term.knots, term.log_odds)
+        return np.asarray(odds)
 
 
 class FeatureStatistics(_Frozen):
@@ -214,11 +229,7 @@ class Calibration(_Frozen):
             event: ``right`` or ``known``.
             evidence: confidence features in the order of ``features``.
         """
-        model, columns = (self.right if event == "right" else self.known), self.names
-        odds = np.full(evidence.shape[:-1], model.bias)
-        for term in model.terms:
-            odds = odds + np.interp(evidence[..., columns.index(term.feature)], term.knots, term.log_odds)
-        return np.asarray(odds)
+        return (self.right if event == "right" else self.known).log_odds(evidence, self.names)
 
     def deviations(self, evidence: Float64[NDArray[np.float64], "*n F"]) -> Float64[NDArray[np.float64], "*n F"]:
         """Return the distance of each feature from its mean in the calibration data, in standard deviations.

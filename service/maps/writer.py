@@ -5,7 +5,8 @@ import json
 import os
 import shutil
 import tempfile
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import asdict
 from datetime import UTC, datetime
 from pathlib import Path
@@ -40,22 +41,36 @@ def write_bundle(out: Path, content: BundleContent, *, overwrite: bool = False) 
     if out.exists() and not overwrite:
         raise BundleError(f"{out}: already exists; choose another --out or pass --overwrite")
     _require_valid(content)
+    with _in_place(out, f"{out}: the bundle cannot be written", "free disk space or choose another folder") as partial:
+        made = _write_files(partial, content)
+        partial.chmod(0o755)
+    return made
+
+
+@contextmanager
+def _in_place(out: Path, what: str, remedy: str) -> Iterator[Path]:
+    """Yield a folder beside ``out``, and rename it to ``out`` at the end. A failure removes it and leaves ``out`` as it is.
+
+    Args:
+        out: the bundle's folder.
+        what: start of the message of a failure.
+        remedy: what to do about it.
+
+    Raises:
+        BundleError: the file system reports an error.
+    """
     partial: Path | None = None
     try:
         out.parent.mkdir(parents=True, exist_ok=True)
         partial = Path(tempfile.mkdtemp(prefix=f".{out.name}.", suffix=".partial", dir=out.parent))
-        made = _write_files(partial, content)
-        partial.chmod(0o755)
+        yield partial
         _sync(partial)
         _put_in_place(partial, out)
     except OSError as error:
-        raise BundleError(
-            f"{out}: the bundle cannot be written ({error.strerror}); free disk space or choose another folder"
-        ) from error
+        raise BundleError(f"{what} ({error.strerror}); {remedy}") from error
     finally:
         if partial is not None and partial.exists():
             shutil.rmtree(partial, ignore_errors=True)
-    return made
 
 
 def replace_calibration(bundle: Path, calibration: Mapping[str, Any]) -> Manifest:
@@ -73,9 +88,8 @@ def replace_calibration(bundle: Path, calibration: Mapping[str, Any]) -> Manifes
         BundleError: the bundle has no valid manifest, or the file system reports an error.
     """
     old, place = manifest.read_manifest(bundle), bundle.resolve()
-    partial: Path | None = None
-    try:
-        partial = Path(tempfile.mkdtemp(prefix=f".{place.name}.", suffix=".partial", dir=place.parent))
+    remedy = f"free disk space, or get write access to {place.parent}"
+    with _in_place(place, f"{bundle}: the calibration cannot be replaced", remedy) as partial:
         for name in sorted(old.files):
             (partial / name).parent.mkdir(exist_ok=True, parents=True)
             if name != parts.CALIBRATION_FILE:
@@ -91,15 +105,6 @@ def replace_calibration(bundle: Path, calibration: Mapping[str, Any]) -> Manifes
         for folder in {(partial / name).parent for name in old.files}:
             _sync(folder)
         shutil.copymode(place, partial)
-        _sync(partial)
-        _put_in_place(partial, place)
-    except OSError as error:
-        raise BundleError(
-            f"{bundle}: the calibration cannot be replaced ({error.strerror}); free disk space, or get write access to {place.parent}"
-        ) from error
-    finally:
-        if partial is not None and partial.exists():
-            shutil.rmtree(partial, ignore_errors=True)
     return made
 
 

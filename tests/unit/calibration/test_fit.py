@@ -5,6 +5,7 @@ from hypothesis import strategies as st
 from scipy.stats import binom
 
 from model_training.calibration import fit as fitting
+from model_training.calibration.additive import Penalty
 from model_training.calibration.fit import (
     RATES,
     SURE,
@@ -12,13 +13,14 @@ from model_training.calibration.fit import (
     confidences,
     expected_calibration_error,
     fit,
+    held_out_confidences,
     out_of_map_kind,
     pooled,
     thresholds_of,
     upper_bound,
     weights_of,
 )
-from service.confidence.features import FEATURES, RIVALRY, UNWEIGHED
+from service.confidence.features import FEATURES, RIVALRY, TABLE, UNWEIGHED
 from service.errors import DatasetError
 from service.maps.calibration import probability, read_calibration
 from service.option_limits import FALSE_ACCEPT_RATE, SAFE_CONFIDENCE
@@ -158,6 +160,20 @@ def test_confidence_is_0_without_registration(few, calibration):
     has = np.isfinite(few.evidence).all(axis=1)
     assert (found[~has] == 0).all()
     np.testing.assert_allclose(found[has], calibration.confidence(few.evidence[has]))
+
+
+def test_a_threshold_does_not_see_the_own_fit_of_a_family():
+    """Of two families, the second contradicts the first. Each is predicted from the other, so it is confident where it is wrong."""
+    rng = np.random.default_rng(8)
+    evidence = evidence_of(rng, 4000)
+    high, second = evidence[:, MARGIN] > MEAN, np.arange(4000) >= 2000
+    right = high ^ second
+    asked = asked_of(evidence, right, right, family=np.where(second, "two", "one"))
+    found = held_out_confidences(asked, TABLE, Penalty(1.0, 1.0))
+    assert found[second & high].mean() > 0.9
+    assert found[second & ~high].mean() < 0.1
+    asked.evidence[7] = np.nan
+    assert held_out_confidences(asked, TABLE, Penalty(1.0, 1.0))[7] == 0
 
 
 @pytest.mark.parametrize(
