@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from model_training.calibration.fit import Asked, confidences, expected_calibration_error, fit
-from service.confidence.decision import decide
+from service.confidence.decision import is_acceptable
 from service.maps.calibration import Calibration
 from service.option_limits import FALSE_ACCEPT_RATE
 
@@ -99,7 +99,7 @@ def accepted(
     """
     found = confidence >= calibration.threshold(false_accept_rate)
     for k in np.flatnonzero(found):
-        found[k] = decide(calibration, asked.evidence[k], false_accept_rate).status == "LOCALIZED"
+        found[k] = is_acceptable(calibration, asked.evidence[k], false_accept_rate)
     return found
 
 

@@ -5,9 +5,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import beta
 
 from model_training.calibration.additive import Penalty, fit_additive
+from model_training.calibration.bounds import upper_bound, upper_bounds
 from service.confidence.features import FEATURES, TABLE, Feature
 from service.errors import DatasetError
 from service.maps.calibration import Calibration, FeatureStatistics, Threshold, probability
@@ -19,8 +19,6 @@ RATES = (0.001, 0.002, 0.003, 0.005, 0.01, 0.02, 0.03, 0.05, 0.1)
 FOLDS = 5
 #: Kinds of out-of-map queries.
 OUT_OF_MAP = ("other_city", "removed_streets", "wall", "room")
-#: Certainty of the upper bound of a false-accept rate.
-SURE = 0.95
 #: Strengths of the penalties on contributions and on changes of slope, in queries. They had the smallest loss when each rig family was
 #: predicted from the others (decision 0149).
 RIDGE, SMOOTH = 3.0, 3.0
@@ -177,7 +175,7 @@ def weights_of(asked: Asked) -> NDArray[np.float64]:
 
 
 def thresholds_of(asked: Asked, confidence: NDArray[np.float64]) -> tuple[Threshold, ...]:
-    """Return for each rate the least confidence at which the false-accept rate is at most this, with ``SURE`` certainty.
+    """Return for each rate the least confidence at which the false-accept rate is at most this, with certainty ``bounds.SURE``.
 
     The bound of Clopper and Pearson (Biometrika 1934) covers the finite number of out-of-map queries. Another city, removed streets,
     walls and rooms have equal weight (decision 0039), so the number of queries is the effective one of Kish (Survey Sampling, 1965).
@@ -198,10 +196,10 @@ def thresholds_of(asked: Asked, confidence: NDArray[np.float64]) -> tuple[Thresh
     effective = 1.0 / float((weight**2).sum())
     order = np.argsort(-confidence[outside], kind="stable")
     ranked, passed = confidence[outside][order], np.cumsum(weight[order])
-    bound = upper_bound(passed * effective, effective)
+    bound = upper_bounds(passed * effective, effective)
     found = []
     for rate in RATES:
-        if upper_bound(np.zeros(1), effective)[0] > rate:
+        if upper_bound(0, effective) > rate:
             continue
         first_refused = min(int(np.searchsorted(bound, rate * (1 + 1e-9), side="right")), len(ranked) - 1)
         level = float(min(1.0, np.nextafter(ranked[first_refused], 2.0)))
@@ -224,17 +222,6 @@ def out_of_map_kind(kind: str) -> str:
     """
     without_preset = kind.split(".", maxsplit=1)[0]
     return next((name for name in OUT_OF_MAP if without_preset.endswith(name)), without_preset)
-
-
-def upper_bound(accepted: NDArray[np.float64], queries: float) -> NDArray[np.float64]:
-    """Return the upper Clopper-Pearson bounds of a rate, with ``SURE`` certainty.
-
-    Args:
-        accepted: numbers of accepted queries; effective numbers need not be whole (n,).
-        queries: number of queries.
-    """
-    rest = np.maximum(queries - accepted, 1e-9)
-    return np.asarray(np.where(accepted >= queries, 1.0, beta.ppf(SURE, accepted + 1.0, rest)))
 
 
 def expected_calibration_error(confidence: NDArray[np.float64], right: NDArray[np.bool_], *, bins: int = 15) -> float:

@@ -9,12 +9,13 @@ from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import stats
 from scipy.optimize import minimize
 
+from model_training.calibration.bounds import upper_bound
+from service.confidence.decision import is_acceptable
 from service.confidence.features import FEATURES
 from service.errors import DatasetError
-from service.maps.calibration import Calibration, RigCorrection, probability
+from service.maps.calibration import Calibration, RigCorrection, corrected_log_odds, probability
 from service.option_limits import FALSE_ACCEPT_RATE
 
 #: Standard deviations of the prior: of the offset in nats of log odds, and of the scale. The prior of the offset is that of a site
@@ -26,13 +27,10 @@ LEAST_SCALE = 0.2
 _SCALES, _OFFSETS = (0.2, 0.35, 0.5, 0.75, 1.0, 1.5), (-4.0, -2.0, -1.0, -0.5, 0.0, 0.5, 1.0, 2.0)
 #: Number of blocks of the cross-validation.
 BLOCKS = 5
-#: Confidence of the upper bounds, one-sided.
-BOUND = 0.95
 #: Share of wrong answers among accepted answers that a robot's owner usually asks for. The report says whether the frames support it.
 WRONG_RATE = 0.01
 #: Frames in a bin of the calibration error, at least, and the largest number of bins.
 _BIN_FRAMES, _BINS = 20, 15
-_SHARE, _HALF = FEATURES.index("log_share"), float(np.log(0.5))
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,7 +112,8 @@ def learn_correction(
         scale, offset = fit_correction(odds, frames.right, weight, lower_only=lower_only, label_noise=label_noise)
     else:
         (scale, offset), after = (1.0, 0.0), before
-    accepted = (after >= stock.threshold(FALSE_ACCEPT_RATE)) & (frames.evidence[:, _SHARE] > _HALF)
+    acceptable = [is_acceptable(stock, row, FALSE_ACCEPT_RATE) for row in frames.evidence]
+    accepted = (after >= stock.threshold(FALSE_ACCEPT_RATE)) & np.array(acceptable)
     counts = [int(each.sum()) for each in (accepted & inside, accepted & inside & ~frames.right, accepted & ~inside)]
     return RigCorrection(
         scale=scale,
@@ -179,7 +178,7 @@ def fit_correction(
 
     def cost(parameters: NDArray[np.float64]) -> float:
         scale, offset = parameters
-        p = corrected_confidence(log_odds, float(scale), float(offset), lower_only=lower_only)
+        p = probability(corrected_log_odds(log_odds, float(scale), float(offset), lower_only=lower_only))
         prior = ((scale - 1) / PRIOR_SCALE) ** 2 + (offset / PRIOR_OFFSET_NATS) ** 2
         return float((weight * _loss(p, right, label_noise)).sum() + 0.5 * prior)
 
@@ -201,27 +200,12 @@ def fit_correction(
     return float(best[0]), float(best[1])
 
 
-def corrected_confidence(
-    log_odds: NDArray[np.float64], scale: float, offset: float, *, lower_only: bool
-) -> NDArray[np.float64]:
-    """Return the confidence after a correction, as ``RigCorrection`` computes it (n,).
-
-    Args:
-        log_odds: log odds of the calibration (n,).
-        scale: factor of the log odds.
-        offset: added to the scaled log odds.
-        lower_only: the corrected log odds are never larger than the log odds.
-    """
-    corrected = scale * log_odds + offset
-    return probability(np.minimum(corrected, log_odds) if lower_only else corrected)
-
-
 def calibration_error(
     confidence: NDArray[np.float64], right: NDArray[np.bool_], weight: NDArray[np.float64], *, bins: int | None = None
 ) -> float:
     """Compute the weighted expected calibration error with bins of equal weight.
 
-    With equal weights it is that of ``model_training.calibration.fit``.
+    With equal weights and bins of equal size it is that of ``model_training.calibration.fit``.
 
     Args:
         confidence: confidence of each frame (n,).
@@ -236,18 +220,6 @@ def calibration_error(
     number = np.minimum((middle * bins).astype(int), bins - 1)
     gap = share * (confidence[order] - right[order])
     return float(np.abs(np.bincount(number, gap, minlength=bins)).sum())
-
-
-def upper_bound(events: int, trials: int) -> float:
-    """Return the Clopper-Pearson upper bound of a share, one-sided with confidence ``BOUND``; 1 without trials.
-
-    C. Clopper and E. Pearson, The use of confidence or fiducial limits, Biometrika 1934. It assumes independent trials.
-
-    Args:
-        events: number of events.
-        trials: number of trials.
-    """
-    return 1.0 if events >= trials else float(stats.beta.ppf(BOUND, events + 1, trials - events))
 
 
 def support_of(frames: int, rate: float, what: str) -> str | None:
@@ -343,7 +315,7 @@ def _cross_validated(
         scale, offset = fit_correction(
             log_odds[~held], rest.right, weight, lower_only=lower_only, label_noise=label_noise
         )
-        found[held] = corrected_confidence(log_odds[held], scale, offset, lower_only=lower_only)
+        found[held] = probability(corrected_log_odds(log_odds[held], scale, offset, lower_only=lower_only))
     return found
 
 

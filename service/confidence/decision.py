@@ -46,9 +46,6 @@ def decide(
 ) -> Decision:  # fmt: skip
     """Compute status and confidence from the confidence features.
 
-    At the default false-accept rate and below, an answer outside the range of the calibration data is never LOCALIZED. On a depth camera
-    of 5 m, two thirds of such answers with a confidence above 0.9 were wrong (decision 0149).
-
     In the calibration data every second query comes from outside the map. A caller who sends a prior claims that the robot is in
     the map. So the odds of being in the map change by Bayes' rule (decision 0135). The probability that the chosen place is the
     right place of the map does not change: confidence is P(known) P(right | known).
@@ -72,10 +69,29 @@ def decide(
     unprompted, known = (float(odds) for odds in probability(np.array([known_odds, known_odds + prior_nats])))
     if prior_nats > 0:
         confidence = confidence / max(unprompted, confidence) * known
-    supported = false_accept_rate > FALSE_ACCEPT_RATE or not extrapolated(calibration, evidence)
-    if supported and confidence >= calibration.threshold(false_accept_rate) and evidence[_SHARE] > _HALF:
+    if confidence >= calibration.threshold(false_accept_rate) and is_acceptable(
+        calibration, evidence, false_accept_rate
+    ):
         return Decision("LOCALIZED", confidence)
     return Decision("AMBIGUOUS" if known >= KNOWN else "OUT_OF_MAP", confidence)
+
+
+def is_acceptable(
+    calibration: Calibration, evidence: Float64[NDArray[np.float64], " F"], false_accept_rate: float
+) -> bool:
+    """Return whether an answer may be LOCALIZED, whatever its confidence.
+
+    The best candidate needs the majority of the support. At the default false-accept rate and below, the evidence must lie in the range of
+    the calibration data. On a depth camera of 5 m, two thirds of the answers outside of it with a confidence above 0.9 were wrong
+    (decision 0149).
+
+    Args:
+        calibration: calibration of the map.
+        evidence: confidence features of the answer.
+        false_accept_rate: largest tolerated share of out-of-map queries that become LOCALIZED, 0 to 1.
+    """
+    supported = false_accept_rate > FALSE_ACCEPT_RATE or not extrapolated(calibration, evidence)
+    return supported and bool(evidence[_SHARE] > _HALF)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -166,8 +166,7 @@ class RigCorrection(_Frozen):
         Args:
             log_odds: log odds of the calibration, with the correction of the site.
         """
-        corrected = self.scale * log_odds + self.offset
-        return np.asarray(np.minimum(corrected, log_odds) if self.lower_only else corrected)
+        return corrected_log_odds(log_odds, self.scale, self.offset, lower_only=self.lower_only)
 
 
 class Calibration(_Frozen):
@@ -262,6 +261,21 @@ class Calibration(_Frozen):
             false_accept_rate: tolerated share of accepted out-of-map queries.
         """
         return self.threshold_at(false_accept_rate).confidence
+
+
+def corrected_log_odds(
+    log_odds: Float64[NDArray[np.float64], "*n"], scale: float, offset: float, *, lower_only: bool
+) -> Float64[NDArray[np.float64], "*n"]:
+    """Return log odds after the correction for a rig, ``scale * log_odds + offset``.
+
+    Args:
+        log_odds: log odds of the calibration.
+        scale: factor of the log odds.
+        offset: added to the scaled log odds.
+        lower_only: the corrected log odds are never larger than the log odds.
+    """
+    corrected = scale * log_odds + offset
+    return np.asarray(np.minimum(corrected, log_odds) if lower_only else corrected)
 
 
 def probability(log_odds: Float64[NDArray[np.float64], "*n"]) -> Float64[NDArray[np.float64], "*n"]:

@@ -2,13 +2,11 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scipy.stats import binom
 
 from model_training.calibration import fit as fitting
 from model_training.calibration.additive import Penalty
 from model_training.calibration.fit import (
     RATES,
-    SURE,
     Asked,
     confidences,
     expected_calibration_error,
@@ -17,7 +15,6 @@ from model_training.calibration.fit import (
     out_of_map_kind,
     pooled,
     thresholds_of,
-    upper_bound,
     weights_of,
 )
 from service.confidence.features import FEATURES, RIVALRY, TABLE, UNWEIGHED
@@ -174,23 +171,6 @@ def test_a_threshold_does_not_see_the_own_fit_of_a_family():
     assert found[second & ~high].mean() < 0.1
     asked.evidence[7] = np.nan
     assert held_out_confidences(asked, TABLE, Penalty(1.0, 1.0))[7] == 0
-
-
-@pytest.mark.parametrize(
-    ("accepted", "queries", "bound"),
-    [(0, 26, 0.1088), (0, 300, 0.0099), (1, 100, 0.0466), (5, 100, 0.1023), (7, 7, 1.0)],
-)
-def test_the_upper_bound_by_hand(accepted, queries, bound):
-    """0 of n: 1 - 0.05 ** (1 / n). The others from the table of Clopper and Pearson."""
-    assert upper_bound(np.array([float(accepted)]), queries)[0] == pytest.approx(bound, abs=2e-4)
-
-
-@given(st.integers(1, 400), st.floats(0, 1))
-@settings(max_examples=40)
-def test_at_the_upper_bound_so_few_events_are_improbable(queries, share):
-    accepted = int(share * (queries - 1))
-    bound = upper_bound(np.array([float(accepted)]), queries)[0]
-    assert binom.cdf(accepted, queries, bound) == pytest.approx(1 - SURE, abs=1e-6)
 
 
 def outside(confidence, kind):

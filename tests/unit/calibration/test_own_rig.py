@@ -3,13 +3,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from model_training.calibration.bounds import upper_bound
 from model_training.calibration.own_rig import (
     BLOCKS,
     LEAST_SCALE,
     LabelledFrames,
     blocks_of,
     calibration_error,
-    corrected_confidence,
     fit_correction,
     frames_of,
     joined_frames,
@@ -17,13 +17,12 @@ from model_training.calibration.own_rig import (
     log_odds_of,
     report_lines,
     support_of,
-    upper_bound,
     weights_of,
     with_correction,
 )
 from service.confidence.features import FEATURES
 from service.errors import DatasetError
-from service.maps.calibration import probability
+from service.maps.calibration import corrected_log_odds, probability
 from service.option_limits import FALSE_ACCEPT_RATE
 
 SHARE = FEATURES.index("log_share")
@@ -118,7 +117,7 @@ def test_a_fit_that_may_only_lower_raises_nothing_and_keeps_the_order(rows):
     scale, offset = fit_correction(odds, right, np.ones(len(odds)), lower_only=True)
     assert scale >= LEAST_SCALE
     grid = np.linspace(-25, 25, 101)
-    confidence = corrected_confidence(grid, scale, offset, lower_only=True)
+    confidence = probability(corrected_log_odds(grid, scale, offset, lower_only=True))
     assert (confidence <= probability(grid) + 1e-12).all()
     assert (np.diff(confidence) >= 0).all()
 
@@ -128,7 +127,7 @@ def test_a_fit_that_may_only_lower_corrects_the_upper_end_alone():
     odds = np.r_[np.full(200, 6.0), np.full(200, -4.0)]
     right = np.r_[np.arange(200) % 10 > 0, np.arange(200) % 55 == 0]
     scale, offset = fit_correction(odds, right, np.ones(400), lower_only=True)
-    confidence = corrected_confidence(np.array([6.0, -4.0]), scale, offset, lower_only=True)
+    confidence = probability(corrected_log_odds(np.array([6.0, -4.0]), scale, offset, lower_only=True))
     assert confidence[0] == pytest.approx(0.9, abs=0.02)
     assert confidence[1] == pytest.approx(probability(np.array(-4.0)), abs=0.01)
 
