@@ -22,6 +22,8 @@ class Augmentation(BaseModel):
     Attributes:
         disparity_noise_px: least and greatest standard deviation of the disparity, pixels at 80 px m; drawn log-uniformly.
         scale_error: greatest relative error of the depth scale.
+        monocular: probability per view that the scale has errors as large as those of monocular depth.
+        monocular_scale_error: greatest relative error of such a scale.
         invented_depth: probability per view of a region with false depth where nothing was measured.
         short_range: probability per view that depth ends before the grid's greatest range.
         shortest_range_m: least such range, metres (z).
@@ -45,9 +47,11 @@ class Augmentation(BaseModel):
 
     disparity_noise_px: tuple[float, float] = (0.02, 0.7)
     scale_error: float = 0.02
+    monocular: float = 0.1
+    monocular_scale_error: float = 0.12
     invented_depth: float = 0.2
     short_range: float = 0.25
-    shortest_range_m: float = 12.0
+    shortest_range_m: float = 8.0
     no_colour: float = 0.4
     narrow_rows: float = 0.2
     narrow_columns: float = 0.2
@@ -188,7 +192,8 @@ class Augmenter:
     def _stereo(self, z: Tensor, measured: Tensor) -> tuple[Tensor, Tensor]:
         """Add stereo errors: correlated noise, bleeding edges, false depth in gaps, holes and a scale error."""
         s, count = self.settings, len(z)
-        z = z * (1 + (self._uniform(count, 1, 1) * 2 - 1) * s.scale_error)
+        largest = torch.where(self._chance(count, s.monocular), s.monocular_scale_error, s.scale_error)
+        z = z * (1 + (self._uniform(count, 1, 1) * 2 - 1) * largest)
         low, high = (torch.log(torch.tensor(v)) for v in s.disparity_noise_px)
         sigma = torch.exp(low + (high - low) * self._uniform(count, 1, 1))
         rows, columns = self.grid.rows, self.grid.columns

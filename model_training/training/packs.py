@@ -30,7 +30,7 @@ from service.imaging.pca import level_scan
 from service.imaging.view_grid import ViewGrid, panorama_from_points
 
 #: Version of the pack format; part of the folder's name.
-FORMAT = 2
+FORMAT = 3
 #: Matched views per traversal. Then the next rig follows, with new rectification errors and another sun.
 DRIVE_VIEWS = 60
 #: Rays that show whether an object stands directly in front of the camera (128, 3).
@@ -53,6 +53,8 @@ class PackPlan:
         lidar: name of the survey LiDAR.
         size_m: size of the city, metres.
         rigs: stereo rigs of the queries, used in turn; empty for clean depth.
+        lidar_height_m: height of the survey LiDAR above the ground, metres.
+        camera_height_m: least and greatest height of the camera of clean queries above the ground, metres; drawn log-uniformly.
     """
 
     seed: int
@@ -62,12 +64,18 @@ class PackPlan:
     lidar: str = "paper_32"
     size_m: tuple[float, float] = (300.0, 400.0)
     rigs: tuple[MatchedRig, ...] = ()
+    lidar_height_m: float = 1.8
+    camera_height_m: tuple[float, float] = (1.2, 1.9)
 
     @property
     def stem(self) -> str:
         """Folder name of the pack."""
         matched = f"{MATCHED}-{_digest(self.rigs)}" if self.rigs else ""
-        return f"pack{FORMAT}-{self.name}-{self.seed}-{self.places}x{self.queries_a_place}-{self.lidar}{matched}"
+        low, high = self.camera_height_m
+        heights = f"{self.lidar_height_m:g}m-{low:g}to{high:g}m"
+        return (
+            f"pack{FORMAT}-{self.name}-{self.seed}-{self.places}x{self.queries_a_place}-{self.lidar}-{heights}{matched}"
+        )
 
 
 @dataclass(frozen=True)
@@ -189,7 +197,7 @@ def make_pack(plan: PackPlan, folder: Path, grid: ViewGrid) -> None:
         aside = rng.uniform(-2.2, 2.2)
         x, y = station.x + aside * np.sin(station.heading), station.y - aside * np.cos(station.heading)
         moved = type(station)(x, y, station.heading + (np.pi if rng.random() < 0.5 else 0.0), station.travelled)
-        T = lidar_pose(city, moved, rng, height_m=1.8 + rng.normal(0, 0.08))
+        T = lidar_pose(city, moved, rng, height_m=plan.lidar_height_m + rng.normal(0, 0.08))
         points = scan(survey, city.ground, model, lidar_rays, T, clear, rng)
         level = level_scan(points[:, :3])
         levelled = np.c_[points[:, :3] @ level.R_level_sensor.T.astype(np.float32), points[:, 3]]
@@ -260,7 +268,7 @@ def _queries(
         for place in places:
             for _ in range(6):
                 x, y, heading = _near(place, rng)
-                height = rng.uniform(1.2, 1.9)
+                height = np.exp(rng.uniform(*np.log(plan.camera_height_m)))
                 roll, pitch, yaw = np.deg2rad(rng.normal(0, [0.6, 0.6, 0.0]))
                 R = upright_on(city, x, y, heading) @ rotation_z(yaw) @ rotation_y(pitch) @ rotation_x(roll)
                 origin = np.array([x, y, city.height(x, y) + height])

@@ -7,12 +7,14 @@ The paper's city belongs to the evaluation too.
 
 from collections.abc import Callable
 from dataclasses import replace
+from itertools import cycle, islice
 
 from model_training.simulation.exposure import RGBS
 from model_training.simulation.plan import CameraPlan
 from model_training.simulation.stereo_pair import STEREOS
 from model_training.training.matched_views import MatchedRig
-from model_training.training.packs import PackPlan
+from model_training.training.packs import DRIVE_VIEWS, PackPlan
+from model_training.training.random_rigs import HEIGHT_M, random_rigs
 
 #: Seeds of the training cities.
 TRAINING_SEEDS = range(1000, 2000)
@@ -86,6 +88,8 @@ _MATCHED_LIDARS = ("hdl_64", "hdl_32", "hdl_64", "os1_64", "hdl_64")
 
 #: Clean and matched cities of the matched recipe. The clean ones keep the encoder from forgetting what it learnt.
 _CLEAN_BESIDE, _MATCHED = 6, 5
+#: Matched cities of a car and a small robot in the recipe of random rigs.
+_CAR_BESIDE = 5
 
 
 def matched_plans(cities: int = _MATCHED) -> list[PackPlan]:
@@ -107,6 +111,45 @@ def matched_plans(cities: int = _MATCHED) -> list[PackPlan]:
     ]
 
 
+#: Index of the first seed of ``rig_plans``, after those of the matched recipe.
+_RIGS_FROM = 60
+#: LiDAR, its height (m) and kind of city, one after the other.
+_SURVEYS = (
+    ("hdl_64", 1.73, "mixed"),
+    ("vlp_16", 1.6, "city"),
+    ("hdl_32", 1.5, "mixed"),
+    ("os1_64", 1.2, "mixed"),
+    ("hdl_64", 1.9, "city"),
+    ("pandar_64", 2.0, "mixed"),
+    ("vlp_16", 1.4, "mixed"),
+    ("os1_128", 1.8, "city"),
+    ("hdl_64", 1.73, "mixed"),
+    ("hdl_32", 1.8, "mixed"),
+)
+#: Cities with stereo-matched and with modelled depth, and places of each.
+_RIG_MATCHED, _RIG_MODELLED, _RIG_PLACES = 8, 6, 960
+
+
+def rig_plans() -> list[PackPlan]:
+    """Plan cities that are asked by random rigs: first with stereo-matched depth, then with modelled depth."""
+    plans = [
+        PackPlan(
+            seed=TRAINING_SEEDS[_RIGS_FROM + k],
+            name=kind,
+            places=_RIG_PLACES,
+            queries_a_place=1 if k < _RIG_MATCHED else 2,
+            lidar=lidar,
+            lidar_height_m=height_m,
+            camera_height_m=HEIGHT_M,
+        )
+        for k, (lidar, height_m, kind) in enumerate(islice(cycle(_SURVEYS), _RIG_MATCHED + _RIG_MODELLED))
+    ]
+    rigs = -(-_RIG_PLACES // DRIVE_VIEWS)
+    return [
+        replace(plan, rigs=random_rigs(plan.seed, rigs)) if k < _RIG_MATCHED else plan for k, plan in enumerate(plans)
+    ]
+
+
 def watch_plans() -> list[PackPlan]:
     """Plan the validation city of the training."""
     return [PackPlan(seed=WATCH_SEEDS[0], places=900, queries_a_place=1)]
@@ -121,5 +164,6 @@ def paper_plans() -> list[PackPlan]:
 RECIPES: dict[str, Callable[[int], list[PackPlan]]] = {
     "stock": stock_plans,
     "matched": lambda _: [*stock_plans(_CLEAN_BESIDE), *matched_plans()],
+    "rigs": lambda _: [*stock_plans(_CLEAN_BESIDE), *matched_plans(_CAR_BESIDE), *rig_plans()],
     "paper": lambda _: paper_plans(),
 }
