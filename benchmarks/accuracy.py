@@ -24,6 +24,7 @@ from benchmarks.rigs import rig_rows
 from benchmarks.runs import Runs, share
 from benchmarks.sequences import sequence_rows
 from benchmarks.speed import speed_rows
+from benchmarks.tracks import track_rows
 from benchmarks.weather import weather_rows
 from model_training.evaluation.error_measures import wilson_interval
 from model_training.simulation.plan import SimulationPlan
@@ -185,6 +186,7 @@ def main() -> None:
         "doubt": lambda: doubt_rows(report, runs),
         "conditions": lambda: condition_rows(report, runs),
         "sequences": lambda: sequence_rows(report, runs),
+        "tracks": lambda: track_rows(report, runs),
         "priors": lambda: prior_rows(report, runs),
         "heights": lambda: height_rows(report, runs),
         "rigs": lambda: rig_rows(report, arguments.encoder, arguments.calibration_work),

@@ -9,6 +9,8 @@ HARD_COUNT, SEQUENCES, SEQUENCE = 500, 300, 5
 LARGE_M = (600.0, 400.0)
 #: Heights of the camera, metres; queries of each (with each depth camera), and extent of their city.
 HEIGHTS_M, HEIGHT_COUNT, HEIGHT_CITY_M = (0.2, 0.4, 0.8, 1.5, 2.5, 3.5), 100, (300.0, 200.0)
+#: Frames of a robot that is followed, the distance between them, robots with each depth camera, and the extent of their city.
+TRACK_FRAMES, TRACK_STEP_M, TRACKS, TRACK_CITY_M = 8, 2.0, 40, (250.0, 300.0)
 REPEATING_DRIVES = 4  # of 120 sequences each; a sixth of them pass a landmark
 
 
@@ -98,3 +100,27 @@ def repeating_plan() -> SimulationPlan:
         for k in range(1, REPEATING_DRIVES + 1)
     )
     return SimulationPlan(name="repeating", city="repeating", seed=EVALUATION_SEEDS[21], queries=queries)
+
+
+def track_plan() -> SimulationPlan:
+    """Plan robots that drive through a city of mixed districts, some of them behind other vehicles."""
+    drive = QueryPlan(
+        name="track",
+        traversal=70,
+        count=TRACKS,
+        depths=BOTH,
+        sequence=TRACK_FRAMES,
+        step_m=TRACK_STEP_M,
+        aside_m=1.5,
+        followed=0.2,
+    )
+    return SimulationPlan(
+        name="track", city="mixed", seed=EVALUATION_SEEDS[31], size_m=TRACK_CITY_M, lidar="hdl_32", queries=(drive,)
+    )
+
+
+def other_track_plan() -> SimulationPlan:
+    """Plan another city, whose map does not show where these robots are."""
+    return SimulationPlan(
+        name="track-elsewhere", city="mixed", seed=EVALUATION_SEEDS[32], size_m=TRACK_CITY_M, lidar="hdl_32", queries=()
+    )

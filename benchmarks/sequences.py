@@ -19,7 +19,16 @@ def between_landmarks(found: Predictions) -> NDArray[np.bool_]:
     Args:
         found: answers with ground truth.
     """
-    x = found.T_true[:, 0, 3]
+    return far_from_landmarks(found.T_true)
+
+
+def far_from_landmarks(T_map_camera: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Return which poses (N,) see neither a landmark nor the street's ends.
+
+    Args:
+        T_map_camera: true poses (N, 4, 4), metres.
+    """
+    x = T_map_camera[:, 0, 3]
     away = np.abs(x[:, None] - landmarks_m()).min(axis=1)
     return np.asarray((away >= FAR_M) & (np.abs(x) < landmarks_m().max() + PASSED_M))
 

@@ -25,6 +25,7 @@ if TYPE_CHECKING:
         PriorWgs84,
         RefusedError,
         StreetfixError,
+        Track,
     )
     from service.imaging.level import GivenHeight
     from service.localization.localizer import Localizer
@@ -49,6 +50,7 @@ __all__ = [
     "Query",
     "RefusedError",
     "StreetfixError",
+    "Track",
 ]
 #: Modules of the names that are not in ``service.client``.
 _MODULES = {

@@ -3,6 +3,7 @@
 import gc
 import math
 import os
+import secrets
 import signal
 import socket
 import tempfile
@@ -161,12 +162,17 @@ def serve(settings: "Settings") -> None:
         StreetfixError: no map is given, or no given bundle can be mounted. With the setting ``strict``: one cannot be mounted.
         AddressError: the address is taken or does not belong to this machine.
     """
+    from pydantic import SecretStr
+
     from service.runtime.heap import keep_little
+    from service.runtime.seal import LEAST_KEY
     from service.runtime.threads import usable_cores
 
     if not settings.maps:
         raise BundleError("there is no map to serve: streetfix serve BUNDLE, or set STREETFIX_MAPS")
     keep_little(settings.threads or usable_cores())
+    if settings.belief_key is None:  # the workers need the same one
+        settings = settings.model_copy(update={"belief_key": SecretStr(secrets.token_hex(LEAST_KEY))})
     if settings.workers == 1:
         with (
             _hangup_held_back(),

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 from service.client.async_client import AsyncClient
 from service.client.client import Client
-from service.client.prepare import About, AboutSequence, Frame
+from service.client.prepare import About, AboutSequence, Frame, Track
 from service.client.retry import RetryPolicy
 from service.contract.schema import (
     LocalizeAnswer,
@@ -60,6 +60,7 @@ __all__ = [
     "RequestError",
     "RetryPolicy",
     "StreetfixError",
+    "Track",
     "UnavailableError",
     "UnreachableError",
 ]

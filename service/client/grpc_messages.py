@@ -111,6 +111,7 @@ def answer_of(message: pb.LocalizeResponse) -> schema.LocalizeAnswer:
             }
             if message.HasField("threshold")
             else None,
+            "belief": _belief_content(message.belief) if message.HasField("belief") else None,
             "map": {"name": message.map.name, "version": message.map.version},
             "timings_ms": {
                 stage: getattr(times, f"{stage}_ms")
@@ -118,6 +119,19 @@ def answer_of(message: pb.LocalizeResponse) -> schema.LocalizeAnswer:
             },
         }
     )
+
+
+def _belief_content(message: pb.Belief) -> dict[str, Any]:
+    return {
+        "epoch": message.epoch,
+        "modes": [
+            {"pose": _pose_content(each.pose), "weight": each.weight, "number": each.number, "unseen": each.unseen}
+            for each in message.modes
+        ],
+        "elsewhere": message.elsewhere,
+        "outside": message.outside,
+        "token": message.token if message.HasField("token") else None,
+    }
 
 
 def map_of(message: pb.MapEntry) -> schema.MapEntry:
@@ -146,6 +160,9 @@ def _pair(request: schema.LocalizeRequest, pictures: tuple[bytes, bytes]) -> pb.
         options=_options(request.options),
         prior=_prior(request.prior),
         vehicle_base_on_ground=request.vehicle_base_on_ground,
+        track=None
+        if request.track is None
+        else pb.Track(belief=request.track.belief, previous_from_camera=_transform(request.track.T_previous_camera)),
     )
 
 

@@ -22,6 +22,20 @@ Depth = NDArray[Any] | bytes
 Camera = PinholeCamera | schema.Camera
 
 
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class Track:
+    """State of a moving robot between two queries; ``Track()`` begins.
+
+    Attributes:
+        before: the answer to the query before.
+        T_previous_camera: (4, 4), pose of this camera in the frame of the previous query's camera, from odometry, metres.
+            None: the odometry is unknown, and the track begins again.
+    """
+
+    before: schema.LocalizeAnswer | None = None
+    T_previous_camera: NDArray[Any] | None = None
+
+
 class About(TypedDict, total=False):
     """Optional data of a query.
 
@@ -41,6 +55,7 @@ class About(TypedDict, total=False):
         camera_height_std_m: standard deviation of ``camera_height_m``, metres. The default is 0.05.
         vehicle_base_on_ground: whether the origin of the vehicle frame lies on the ground, as that of ``base_footprint``. Then the
             height of the camera follows from ``T_vehicle_camera``.
+        track: state of a moving robot. The answer then has a ``belief`` over all frames.
     """
 
     map: str | None
@@ -55,6 +70,7 @@ class About(TypedDict, total=False):
     camera_height_m: float | None
     camera_height_std_m: float | None
     vehicle_base_on_ground: bool
+    track: Track | None
 
 
 class AboutSequence(TypedDict, total=False):
@@ -146,7 +162,8 @@ def one(
     known = {name: about[name] for name in names if name in about}  # type: ignore[literal-required]  # names of About
     frame = Frame(rgb=rgb, depth=depth, camera=camera, **known)
     said, pictures = _frame(frame, packing)
-    return PreparedRequest(_checked(lambda: schema.LocalizeRequest.model_validate(said | _of_all(about))), (pictures,))
+    content = said | _of_all(about) | _track(about.get("track"))
+    return PreparedRequest(_checked(lambda: schema.LocalizeRequest.model_validate(content)), (pictures,))
 
 
 def several(frames: Sequence[Frame], about: AboutSequence, packing: Packing) -> PreparedRequest[schema.BatchRequest]:
@@ -260,6 +277,15 @@ def _of_all(about: About | AboutSequence) -> dict[str, Any]:
         | ({} if options is None else {"options": options})
         | ({"vehicle_base_on_ground": about["vehicle_base_on_ground"]} if "vehicle_base_on_ground" in about else {})
     )
+
+
+def _track(track: Track | None) -> dict[str, Any]:
+    """Return the field of a track; none without a track, because an earlier service does not know it."""
+    if track is None:
+        return {}
+    belief = None if track.before is None else track.before.belief
+    T = _transform(track.T_previous_camera, "track.T_previous_camera")
+    return {"track": {"belief": None if belief is None else belief.token, "T_previous_camera": T}}
 
 
 def _camera(camera: Camera) -> dict[str, Any]:

@@ -34,10 +34,12 @@ class Decision:
     Attributes:
         status: LOCALIZED, AMBIGUOUS or OUT_OF_MAP.
         confidence: probability that the position is within 1 m, 0 to 1.
+        known: probability that the camera is in the map, 0 to 1; at least ``confidence``.
     """
 
     status: Status
     confidence: float
+    known: float
 
 
 def decide(
@@ -60,7 +62,7 @@ def decide(
         The decision; OUT_OF_MAP with confidence 0 without ``evidence``.
     """
     if evidence is None:
-        return Decision("OUT_OF_MAP", 0.0)
+        return Decision("OUT_OF_MAP", 0.0, 0.0)
     confidence = float(calibration.confidence(evidence))
     known_odds = calibration.log_odds("known", evidence)
     # A right answer is in the map, and the correction of a rig may raise the confidence above ``known``.
@@ -72,8 +74,8 @@ def decide(
     if confidence >= calibration.threshold(false_accept_rate) and is_acceptable(
         calibration, evidence, false_accept_rate
     ):
-        return Decision("LOCALIZED", confidence)
-    return Decision("AMBIGUOUS" if known >= KNOWN else "OUT_OF_MAP", confidence)
+        return Decision("LOCALIZED", confidence, known)
+    return Decision("AMBIGUOUS" if known >= KNOWN else "OUT_OF_MAP", confidence, known)
 
 
 def is_acceptable(
@@ -119,28 +121,47 @@ class Outcome:
     threshold: Threshold | None = None
 
 
-def outcome_of(
-    calibration: Calibration | None, query: Query, refined: Refined | None, evidence: Float64[NDArray[np.float64], " F"] | None, *,
-    frames: int, extent: Extent,
-) -> Outcome:  # fmt: skip
-    """Compute status, confidence, reasons and spread of an answer.
+def decision_of(
+    calibration: Calibration | None, query: Query, refined: Refined | None, evidence: Float64[NDArray[np.float64], " F"] | None
+) -> Decision | None:  # fmt: skip
+    """Decide about an answer, with the prior and the false-accept rate of its query.
 
     Args:
         calibration: calibration of the map; None if the map has none, or if the query asked for no registration.
-        query: the reference; its prior and its false-accept rate count.
+        query: the reference.
         refined: registered candidates; None if nothing was registered, or if the images have too few points.
         evidence: confidence features, in the order of ``service.confidence.features.FEATURES``; None without ``refined``.
-        frames: number of image pairs.
-        extent: extent of the map.
+
+    Returns:
+        The decision; None without a calibration.
     """
-    candidates = None if refined is None else refined.candidates
     if calibration is None:
-        return Outcome("LOCALIZED", None, (), candidates, None)
+        return None
     prior_nats = 0.0
     if query.prior is not None and refined is not None:
         T = refined.best.T_map_camera
         prior_nats = query.prior.known_nats(T[:2, 3], heading_of_camera(T))
-    decision = decide(calibration, evidence, query.false_accept_rate, prior_nats=prior_nats)
+    return decide(calibration, evidence, query.false_accept_rate, prior_nats=prior_nats)
+
+
+def outcome_of(
+    calibration: Calibration | None, query: Query, refined: Refined | None, evidence: Float64[NDArray[np.float64], " F"] | None,
+    decision: Decision | None, *, frames: int, extent: Extent,
+) -> Outcome:  # fmt: skip
+    """Compute reasons and spread of an answer from its decision.
+
+    Args:
+        calibration: calibration of the map; None if the map has none, or if the query asked for no registration.
+        query: the reference; its false-accept rate counts.
+        refined: registered candidates; None if nothing was registered, or if the images have too few points.
+        evidence: confidence features, in the order of ``service.confidence.features.FEATURES``; None without ``refined``.
+        decision: as from ``decision_of``; a track may replace it by its own.
+        frames: number of image pairs.
+        extent: extent of the map.
+    """
+    candidates = None if refined is None else refined.candidates
+    if calibration is None or decision is None:
+        return Outcome("LOCALIZED", None, (), candidates, None)
     outside, threshold = extrapolated(calibration, evidence), calibration.threshold_at(query.false_accept_rate)
     if decision.status == "LOCALIZED":
         return Outcome(decision.status, decision.confidence, (), candidates, None, outside, threshold)

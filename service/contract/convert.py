@@ -1,5 +1,6 @@
 """Convert between the contract and the types of the core, for REST and gRPC. The only arithmetic is degrees to radians."""
 
+import base64
 import math
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -26,12 +27,13 @@ from service.geometry.rigid import (
 from service.geometry.uncertainty import covariance_at
 from service.imaging.level import GivenHeight
 from service.localization.answer import Answer
+from service.localization.belief import Belief
 from service.localization.localizer import Localizer
 from service.maps.reader import MapBundle
 from service.option_limits import LEAST_HEIGHT_M, MOST_HEIGHT_M, VEHICLE_HEIGHT_STD_M
 from service.retrieval.knn import Neighbour
 from service.retrieval.prior import POSITION_STD_M, Prior
-from service.runtime.engine import EncodedQuery, Located
+from service.runtime.engine import CarriedTrack, EncodedQuery, Located
 from service.runtime.last_answers import LastAnswer
 from service.scoring.candidates import distinct_candidates, shares_of
 
@@ -108,7 +110,26 @@ def query_from(request: schema.LocalizeRequest, *, rgb: bytes, depth: bytes) -> 
         prior=None if request.prior is None else _prior(request.prior),
         prior_wgs84=_wgs84(request.prior),
         false_accept_rate=request.options.false_accept_rate,
+        track=None if request.track is None else _track(request.track),
     )
+
+
+def _track(track: schema.Track) -> CarriedTrack:
+    T = track.T_previous_camera
+    return CarriedTrack(
+        None if track.belief is None else _token_bytes(track.belief),
+        None if T is None else transform_of(T, "track.T_previous_camera"),
+    )
+
+
+def _token_bytes(token: str) -> bytes:
+    try:
+        return base64.urlsafe_b64decode(token + "=" * (-len(token) % 4))
+    except ValueError as error:
+        raise RequestError(
+            "track.belief: it is not a token of this service; send belief.token of the answer before, or omit track.belief to begin again",
+            field="track.belief",
+        ) from error
 
 
 def sequence_from(
@@ -242,6 +263,7 @@ def answer_from(located: Located) -> schema.LocalizeAnswer:
         else schema.AcceptanceThreshold(
             confidence=answer.threshold.confidence, false_accept_rate=answer.threshold.false_accept_rate
         ),
+        belief=None if answer.belief is None else _belief(answer.belief, answer.epoch, located.sealed_belief),
         map=schema.MapVersion(name=bundle.name, version=bundle.manifest.version),
         timings_ms=schema.TimingsMs(
             decode=times.decode_ms,
@@ -387,6 +409,24 @@ def _hypotheses(answer: Answer) -> list[schema.HypothesisOfPose]:
         )
         for number, (each, share) in enumerate(zip(candidates, shares_of(candidates, answer.frames), strict=True))
     ]
+
+
+def _belief(belief: Belief, epoch: int, sealed: bytes | None) -> schema.Belief:
+    return schema.Belief(
+        epoch=epoch,
+        modes=[
+            schema.Mode(
+                pose=_pose(mode.T_map_camera, heading_of_camera(mode.T_map_camera), mode.covariance),
+                weight=mode.weight,
+                number=mode.number,
+                unseen=mode.unseen,
+            )
+            for mode in belief.modes
+        ],
+        elsewhere=belief.elsewhere,
+        outside=belief.outside,
+        token=None if sealed is None else base64.urlsafe_b64encode(sealed).rstrip(b"=").decode(),
+    )
 
 
 def _spread(spread: Spread) -> schema.Spread:

@@ -27,6 +27,8 @@ LEAST_FOCAL, MOST_FOCAL = 0.02, 100.0
 LEAST_SIDE, MOST_SIDE, MOST_ASPECT = 2, 32768, 16
 #: Limit of the components of a vector whose length does not matter. An accelerometer may use m/s2, thousandths of g or its own steps.
 MOST_COMPONENT = 1e6
+#: Most characters of the token of a belief. A track of eight modes has 1,850.
+MOST_TOKEN = 2048
 
 
 class _Strict(BaseModel):
@@ -226,6 +228,25 @@ class Options(_Strict):
     )
 
 
+class Track(_Strict):
+    """State of a moving robot that the client carries from request to request. `{}` begins a track.
+
+    The answer then has a `belief`. Send its `token` with the next image pair and the odometry between them.
+    """
+
+    belief: str | None = Field(
+        None,
+        max_length=MOST_TOKEN,
+        pattern=r"^[A-Za-z0-9_-]*$",
+        description="token of the belief of the answer before. Not sent: the track begins",
+    )
+    T_previous_camera: RigidTransform | None = Field(
+        None,
+        description="odometry since the image pair before: pose of this camera in the frame of the previous camera. Not sent: the "
+        "odometry is unknown, and the track begins again",
+    )
+
+
 #: Examples. A camera that looks along the vehicle's x axis, 1.6 m above its origin; and its pose after 0.8 m of straight travel.
 _CAMERA: JsonDict = {"model": "PINHOLE", "width": 640, "height": 480, "fx": 320, "fy": 320, "cx": 319.5, "cy": 239.5}
 _DEPTH: JsonDict = {"scale_m": 0.001, "kind": "z", "max_range_m": 80}
@@ -272,6 +293,9 @@ class LocalizeRequest(_Strict):
     )
     prior: Prior | None = Field(None, description="prior of the camera pose: a position, a heading, or both")
     options: Options = Options()
+    track: Track | None = Field(
+        None, description="state of a moving robot that the client carries. A sequence and a gRPC stream have none"
+    )
 
 
 MOST_FRAMES = 16
@@ -427,7 +451,8 @@ class HypothesisOfPose(BaseModel):
         "The covariance is null for the other hypotheses of a LOCALIZED answer"
     )
     share: float = Field(
-        description="share of the support of all hypotheses, 0 to 1. LOCALIZED needs more than a half for the first hypothesis"
+        description="share of the support of all hypotheses, 0 to 1. Without a track, LOCALIZED needs more than a half for "
+        "the first hypothesis"
     )
     inliers: float = Field(description="share of the depth weight that lies on the map, 0 to 1")
     similarity: float = Field(description="cosine similarity of the query to the places around the pose")
@@ -509,6 +534,35 @@ class AcceptanceThreshold(BaseModel):
     )
 
 
+class Mode(BaseModel):
+    """A pose that a moving robot may have, after all its frames."""
+
+    pose: Pose = Field(description="T_map_camera. Its covariance holds only if this mode is right")
+    weight: float = Field(
+        ge=0, le=1, description="probability that the position is within 1 m. An unseen mode may have drifted farther"
+    )
+    number: int = Field(
+        ge=0, description="identity of the mode within its track. Odometry moves a mode and keeps its number"
+    )
+    unseen: int = Field(ge=0, description="number of frames since the last one that agreed with the mode")
+
+
+class Belief(BaseModel):
+    """Where a moving robot may be, after all frames of its track. The weights of all modes, elsewhere and outside sum to 1."""
+
+    epoch: int = Field(
+        ge=0,
+        description="number of disruptions so far. It rises when a LOCALIZED answer does not continue the last one by odometry, or "
+        "when the track began again. Then the transform from odometry to the map jumps",
+    )
+    modes: list[Mode] = Field(description="the most probable first, at most 8. None of them is confirmed")
+    elsewhere: float = Field(ge=0, le=1, description="probability of all other places of the map")
+    outside: float = Field(ge=0, le=1, description="probability of a place outside the map")
+    token: str | None = Field(
+        description="send it as track.belief with the next image pair. Null in a gRPC stream, which keeps the track itself"
+    )
+
+
 class LocalizeAnswer(BaseModel):
     """Answer to a query. Only a LOCALIZED answer has a pose, a vehicle pose, a geopose and a street.
 
@@ -568,6 +622,10 @@ class LocalizeAnswer(BaseModel):
     threshold: AcceptanceThreshold | None = Field(
         None,  # an earlier service sends none
         description="the threshold that decided the status. Null if confidence is null",
+    )
+    belief: Belief | None = Field(
+        None,  # an earlier service sends none
+        description="where the robot may be, after all frames of its track. Null without a track, and if confidence is null",
     )
     map: MapVersion
     timings_ms: TimingsMs

@@ -47,6 +47,18 @@ def inverse(T_a_b: Transform) -> Transform:
     return transform_from(R.T.copy(), -R.T @ T_a_b[:3, 3])
 
 
+def nearest_rigid(T: Transform) -> Transform:
+    """Project the rotation of a transform onto SO(3) by SVD. Products of many rotations drift away from it.
+
+    Args:
+        T: transform (4, 4), metres.
+    """
+    u, _, vt = np.linalg.svd(T[:3, :3])
+    found = T.copy()
+    found[:3, :3] = u @ vt
+    return found
+
+
 def rotation_x(angle_rad: float) -> Rotation:
     """Return the rotation about the x axis (paper, eq. 7).
 

@@ -56,7 +56,7 @@ def request_from(message: pb.LocalizeRequest) -> schema.LocalizeRequest:
     Raises:
         RequestError: a field is invalid.
     """
-    content = _of_pair(message) | _of_all(message)
+    content = _of_pair(message) | _of_all(message) | _sub(message, "track", "track", _track)
     return checked(content, schema.LocalizeRequest)
 
 
@@ -86,6 +86,10 @@ def transform_from(message: pb.RigidTransform) -> schema.RigidTransform:
         RequestError: a number is invalid.
     """
     return checked(transform_content(message), schema.RigidTransform)
+
+
+def _track(message: pb.Track) -> dict[str, Any]:
+    return _given(message, "belief") | _sub(message, "previous_from_camera", "T_previous_camera", transform_content)
 
 
 def _of_all(message: pb.LocalizeRequest | pb.LocalizeSequenceRequest) -> dict[str, Any]:
@@ -221,6 +225,7 @@ def answer_message(answer: schema.LocalizeAnswer) -> pb.LocalizeResponse:
         else pb.AcceptanceThreshold(
             confidence=answer.threshold.confidence, false_accept_rate=answer.threshold.false_accept_rate
         ),
+        belief=None if answer.belief is None else _belief(answer.belief),
     )
     return message
 
@@ -232,6 +237,19 @@ def map_message(entry: schema.MapEntry) -> pb.MapEntry:
         entry: of the map.
     """
     return pb.MapEntry(**entry.model_dump())
+
+
+def _belief(belief: schema.Belief) -> pb.Belief:
+    return pb.Belief(
+        epoch=belief.epoch,
+        modes=[
+            pb.Mode(pose=_pose(each.pose), weight=each.weight, number=each.number, unseen=each.unseen)
+            for each in belief.modes
+        ],
+        elsewhere=belief.elsewhere,
+        outside=belief.outside,
+        token=belief.token,
+    )
 
 
 def _camera_height(height: schema.CameraHeight) -> pb.CameraHeight:

@@ -13,6 +13,7 @@ from service.confidence.spread import Spread
 from service.errors import NotFiniteError
 from service.geometry.rigid import Transform
 from service.imaging.level import HeightOrigin
+from service.localization.belief import Belief
 from service.maps.calibration import Threshold
 from service.retrieval.hypotheses import Hypothesis
 from service.retrieval.knn import Neighbour, StreetVote
@@ -79,6 +80,8 @@ class Answer:
         height_m: height of the reference camera above the ground, metres.
         height_origin: where this height comes from: the query ("given"), the depth image ("estimated"), or neither ("assumed").
         timings: duration of each stage.
+        belief: belief of a track after this frame; None without a track, and if ``confidence`` is None.
+        epoch: number of disruptions of the track; 0 without a track.
     """
 
     status: Status
@@ -101,6 +104,8 @@ class Answer:
     height_m: float
     height_origin: HeightOrigin
     timings: Timings
+    belief: Belief | None = None
+    epoch: int = 0
 
 
 def require_finite(answer: Answer) -> None:

@@ -1,10 +1,12 @@
 """Localize a query in a map: retrieve places as the paper does, register candidates on the map cloud, and decide."""
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
+from jaxtyping import Float64
+from numpy.typing import NDArray
 
-from service.confidence.decision import outcome_of, require_promise
+from service.confidence.decision import Decision, decision_of, outcome_of, require_promise
 from service.confidence.features import evidence_of, require_features
 from service.confidence.spread import Extent
 from service.geometry.rigid import Transform
@@ -16,8 +18,26 @@ from service.retrieval.encoder import Encoder, Provider
 from service.retrieval.frame import Frame
 from service.retrieval.hypotheses import ClusterSettings
 from service.retrieval.query import Query
-from service.retrieval.retrieve import look_up, require_encoder_of, retrieve
+from service.retrieval.retrieve import Retrieved, look_up, require_encoder_of, retrieve
+from service.scoring.candidates import Refined
 from service.timing import StageTimer
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Found:
+    """What a query has found before its answer is built.
+
+    Attributes:
+        retrieved: places, clusters and street vote of the reference.
+        refined: registered candidates; None if nothing was registered.
+        evidence: confidence features; None without ``refined``.
+        decision: status and confidence; None if the query asked for no registration, or the map has no cloud or no calibration.
+    """
+
+    retrieved: Retrieved
+    refined: Refined | None
+    evidence: Float64[NDArray[np.float64], " F"] | None
+    decision: Decision | None
 
 
 class Localizer:
@@ -97,6 +117,14 @@ class Localizer:
             tuple(replace(self.look_up(query, timer), T_reference_camera=T) for query, T in pairs), timer
         )
 
+    def decides(self, query: Query) -> bool:
+        """Return whether an answer to a query has a confidence: the map has a cloud and a calibration, and the query wants registration.
+
+        Args:
+            query: the reference.
+        """
+        return query.refine and self.bundle.cloud is not None and self.bundle.calibration is not None
+
     def look_up(self, query: Query, timer: StageTimer | None = None) -> Frame:
         """Encode one image pair and search the map for similar views, without registration.
 
@@ -123,22 +151,57 @@ class Localizer:
             NotFiniteError: a number of the answer is not finite, because of a defect of this program or of the map.
         """
         timer = timer or StageTimer()
+        return self.compose(frames, self.register(frames, timer), timer)
+
+    def register(self, frames: tuple[Frame, ...], timer: StageTimer, predicted: tuple[Transform, ...] = ()) -> Found:
+        """Retrieve, register and decide, without the parts of an answer that only its reader needs.
+
+        Args:
+            frames: image pairs, the reference first, as in ``localize_frames``.
+            timer: of the request.
+            predicted: poses T_map_camera of the reference from odometry. Registration starts from them too.
+
+        Raises:
+            RequestError: the calibration does not support such a low false-accept rate.
+        """
         bundle, query = self.bundle, frames[0].query
         cloud = bundle.cloud if query.refine else None
-        calibration = None if cloud is None else bundle.calibration
         require_promise(bundle.calibration if query.refine else None, query)
         # 1. Retrieval: the most similar places, clusters of the views, and the paper's K-NN vote over the streets.
         with timer.stage("search"):
             retrieved = retrieve(bundle, frames[0], self.clusters)
         with timer.stage("register"):
             # 2. Registration: refine candidate poses on the map cloud, and rank them.
-            refined = None if cloud is None else refine(bundle, cloud, frames, query.prior, self.refining)
+            refined = None if cloud is None else refine(bundle, cloud, frames, query.prior, self.refining, predicted)
             # 3. Confidence features of the best candidate and its rivals.
             evidence = None
             if refined is not None:
                 places_m, grid = bundle.T_map_place[:, :2, 3], bundle.grid
                 evidence = evidence_of(frames, refined, retrieved.neighbours, retrieved.hypotheses, places_m, grid)
-            # 4. Decision: status and calibrated confidence; reasons and spread if the answer is not LOCALIZED.
-            outcome = outcome_of(calibration, query, refined, evidence, frames=len(frames), extent=self.extent)
-        # 5. Build the answer, and check that all its numbers are finite.
-        return compose(bundle, frames, retrieved, refined, evidence, outcome, timer)
+            # 4. Decision: status and calibrated confidence.
+            calibration = bundle.calibration if self.decides(query) else None
+            return Found(retrieved, refined, evidence, decision_of(calibration, query, refined, evidence))
+
+    def compose(self, frames: tuple[Frame, ...], found: Found, timer: StageTimer) -> Answer:
+        """Build the answer.
+
+        Args:
+            frames: image pairs, the reference first.
+            found: result of ``register`` for these frames.
+            timer: of the request.
+
+        Raises:
+            NotFiniteError: a number of the answer is not finite, because of a defect of this program or of the map.
+        """
+        # 5. Reasons and spread if the answer is not LOCALIZED. Then the answer, and a check that all its numbers are finite.
+        with timer.stage("register"):
+            outcome = outcome_of(
+                None if found.decision is None else self.bundle.calibration,
+                frames[0].query,
+                found.refined,
+                found.evidence,
+                found.decision,
+                frames=len(frames),
+                extent=self.extent,
+            )
+        return compose(self.bundle, frames, found.retrieved, found.refined, found.evidence, outcome, timer)

@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float64
 from numpy.typing import NDArray
 
-from service.geometry.rigid import heading_of_camera, transform_from
+from service.geometry.rigid import Transform, heading_of_camera, transform_from
 from service.maps.reader import MapBundle
 from service.registration.covariance import (
     OF_POINTS,
@@ -20,14 +20,14 @@ from service.registration.covariance import (
 from service.registration.local_search import LocalSearchSettings, search_locally
 from service.registration.points import FOCAL_BASELINE_PX_M, PointSettings
 from service.registration.rays import RaySettings, adjust
-from service.registration.register import RegistrationSettings, register
+from service.registration.register import RegistrationSettings, Start, register
 from service.registration.surfel_map import SurfelMap
 from service.registration.visibility import SurfelRaycaster
 from service.retrieval.frame import Frame
 from service.retrieval.prior import Prior
 from service.retrieval.starts import StartSettings, starts_from
 from service.scoring.candidates import Candidate, Refined
-from service.scoring.measured import measure, merged_points
+from service.scoring.measured import MeasuredFrame, measure, merged_points
 from service.scoring.photometry import BrightnessScorer, PhotometrySettings
 from service.scoring.similarity import similarity_of
 from service.scoring.support import LocalScoreWeights, PoseScorer, SupportWeights, scorers_of
@@ -86,7 +86,12 @@ OFFSET_PX = 0.6
 
 
 def refine(
-    bundle: MapBundle, cloud: SurfelMap, frames: tuple[Frame, ...], prior: Prior | None, settings: RefineSettings
+    bundle: MapBundle,
+    cloud: SurfelMap,
+    frames: tuple[Frame, ...],
+    prior: Prior | None,
+    settings: RefineSettings,
+    predicted: tuple[Transform, ...] = (),
 ) -> Refined | None:
     """Register image pairs on the map cloud; return None if they have too few points.
 
@@ -96,6 +101,7 @@ def refine(
         frames: image pairs, the reference first.
         prior: prior of the reference pose; None if nothing is known.
         settings: settings of registration and scoring.
+        predicted: further starts T_map_camera of the reference, for example from odometry. They compete like all others.
     """
     reference = frames[0]
     rig_px_m = reference.query.focal_baseline_px_m
@@ -116,6 +122,7 @@ def refine(
         settings=settings.starts,
         likeness=None if len(frames) == 1 else lambda T_map_level: similarity_of(bundle, measured, T_map_level)[0],
     )
+    starts += _starts_at(bundle, measured, reference, predicted, first=len(starts))
     found = register(cloud, points, starts, reference.views.height_m, settings.registration)
     # 3. Scores, and other local minima around the best pose.
     raycaster = SurfelRaycaster(cloud, settings.rays)
@@ -164,3 +171,22 @@ def refine(
         disagreement=disagreement(best.information, scatter),
         covariance_at=covariance_at,
     )
+
+
+def _starts_at(
+    bundle: MapBundle,
+    measured: tuple[MeasuredFrame, ...],
+    reference: Frame,
+    predicted: tuple[Transform, ...],
+    *,
+    first: int,
+) -> list[Start]:
+    """Return predicted poses T_map_camera of the reference as starts, numbered from ``first``."""
+    if not predicted:
+        return []
+    T_map_level = np.stack([transform_from(T[:3, :3] @ reference.R_level_camera.T, T[:3, 3]) for T in predicted])
+    similarity, _ = similarity_of(bundle, measured, T_map_level)
+    return [
+        Start(T[:3, :3], T[:3, 3], first + k, float(alike))
+        for k, (T, alike) in enumerate(zip(T_map_level, similarity, strict=True))
+    ]

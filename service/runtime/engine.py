@@ -14,6 +14,8 @@ from service.imaging.level import GivenHeight
 from service.imaging.view_grid import ViewGrid
 from service.localization.answer import Answer
 from service.localization.localizer import Localizer
+from service.localization.track_bytes import packed, unpacked
+from service.localization.tracker import Track, follow
 from service.maps.reader import MapBundle
 from service.option_limits import NEIGHBOURS
 from service.retrieval.frame import Frame
@@ -31,11 +33,25 @@ from service.runtime.memory import (
     budget_of,
 )
 from service.runtime.metrics import Metrics
+from service.runtime.seal import Seal
 from service.runtime.serving_table import ServingTable
 from service.runtime.settings import Settings
 from service.runtime.threads import limit_pools, usable_cores
 from service.runtime.tracing import Tracing
 from service.timing import StageTimer
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CarriedTrack:
+    """What a client sends to continue its track.
+
+    Attributes:
+        sealed_belief: bytes of the answer before; None begins.
+        T_previous_camera: odometry, from this camera's frame to the previous camera's frame, (4, 4), metres; None if it is unknown.
+    """
+
+    sealed_belief: bytes | None
+    T_previous_camera: NDArray[np.float64] | None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -60,6 +76,7 @@ class EncodedQuery:
         prior: prior of the camera pose; None if nothing is known.
         prior_wgs84: latitude and longitude (degrees) of the prior's position, if it was given so.
         false_accept_rate: share of out-of-map queries that may be LOCALIZED; None takes the setting of the service.
+        track: state that the client carries; None for a query without memory.
     """
 
     rgb: bytes
@@ -79,14 +96,16 @@ class EncodedQuery:
     prior: Prior | None = None
     prior_wgs84: tuple[float, float] | None = None
     false_accept_rate: float | None = None
+    track: CarriedTrack | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Located:
-    """An answer and the map bundle that gave it."""
+    """An answer, the map bundle that gave it, and the sealed belief for a client that carries it."""
 
     answer: Answer
     bundle: MapBundle
+    sealed_belief: bytes | None = None
 
 
 class Engine:
@@ -107,6 +126,7 @@ class Engine:
         self.memory = budget_of(settings, threads=self.threads)
         self.metrics = Metrics(self.admission, registry, self.memory)
         self.last_answers = LastAnswers()
+        self._seal = Seal(None if settings.belief_key is None else settings.belief_key.get_secret_value())
         endpoint = settings.traces_endpoint
         self.tracing = None if endpoint is None else Tracing.open(endpoint, share=settings.traces_share)
         self.is_draining = False
@@ -164,6 +184,8 @@ class Engine:
             UnsupportedFormatError: the format of an image is not supported.
             TooLargeError: an image exceeds the limits.
         """
+        if encoded.track is not None:
+            return self._continued(encoded, encoded.track)
         return self.localize_sequence((encoded,), (np.eye(4),))
 
     def localize_sequence(
@@ -199,11 +221,61 @@ class Engine:
             frames: the reference first.
             timer: of the request.
         """
-        answer = localizer.answer(frames, timer)
-        self.metrics.answered(answer, localizer.bundle, frames=len(frames))
+        return self._counted(localizer.answer(frames, timer), localizer)
+
+    def follow(
+        self,
+        localizer: Localizer,
+        encoded: EncodedQuery,
+        track: Track,
+        T_previous_camera: NDArray[np.float64] | None,
+    ) -> tuple[Located, Track]:
+        """Decode and answer the next frame of a robot, and count the answer in the metrics.
+
+        Args:
+            localizer: of the map.
+            encoded: the frame.
+            track: of the frames before.
+            T_previous_camera: odometry, from this camera's frame to the previous camera's frame, metres; None if it is unknown.
+
+        Raises:
+            StreetfixError: as for ``localize``.
+        """
+        timer = StageTimer()
+        answer, following = follow(localizer, self.look_up(localizer, encoded, timer), track, T_previous_camera, timer)
+        if following.epoch != track.epoch:
+            self.metrics.disrupted(localizer.bundle)
+        return self._counted(answer, localizer), following
+
+    def _counted(self, answer: Answer, localizer: Localizer) -> Located:
+        self.metrics.answered(answer, localizer.bundle, frames=answer.frames)
         if self.settings.console:  # only the console reads them
-            self.last_answers.add(answer, localizer.bundle, frames=len(frames))
+            self.last_answers.add(answer, localizer.bundle, frames=answer.frames)
         return Located(answer, localizer.bundle)
+
+    def _continued(self, encoded: EncodedQuery, carried: CarriedTrack) -> Located:
+        """Answer a query whose client carries the belief.
+
+        Raises:
+            RequestError: the belief was not sealed by this service.
+        """
+        localizer = self.registry.get(encoded.map_name)
+        version = f"{localizer.bundle.name}@{localizer.bundle.manifest.version}"
+        track = Track()
+        if carried.sealed_belief is not None:
+            content = self._seal.opened(carried.sealed_belief)
+            if content is None:
+                raise RequestError(
+                    "track.belief: it does not come from this service, or the service has another key since it was restarted; omit "
+                    "track.belief to begin again, or set STREETFIX_BELIEF_KEY to the same value in all replicas",
+                    field="track.belief",
+                )
+            track = unpacked(content, map_version=version)
+        located, following = self.follow(localizer, encoded, track, carried.T_previous_camera)
+        if located.answer.belief is None:
+            return located
+        content = packed(following, map_version=version)
+        return replace(located, sealed_belief=self._seal.sealed(content))
 
     def look_up(self, localizer: Localizer, encoded: EncodedQuery, timer: StageTimer) -> Frame:
         """Decode an image pair and retrieve its most similar places.

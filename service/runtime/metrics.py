@@ -79,6 +79,12 @@ class Metrics:
             ["map", "feature"],
             registry=self._registry,
         )
+        self._disruptions = Counter(
+            "streetfix_disruptions",
+            "Rises of a track's epoch: the robot was displaced, or the track began again.",
+            ["map"],
+            registry=self._registry,
+        )
         self._confidence = Histogram(
             "streetfix_confidence",
             "Confidence of calibrated answers.",
@@ -117,6 +123,14 @@ class Metrics:
             self._confidence.labels(bundle.name).observe(answer.confidence)
         for stage in STAGES:
             self._stage_seconds.labels(stage).observe(_milliseconds(answer.timings, stage) / 1e3)
+
+    def disrupted(self, bundle: MapBundle) -> None:
+        """Count a rise of a track's epoch.
+
+        Args:
+            bundle: map of the track.
+        """
+        self._disruptions.labels(bundle.name).inc()
 
     def batched(self, requests: int) -> None:
         """Count a batch.

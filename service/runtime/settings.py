@@ -10,7 +10,7 @@ from ipaddress import IPv4Address, IPv6Address, ip_address
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
+from pydantic import BaseModel, ConfigDict, Field, SecretStr, ValidationError, field_validator, model_validator
 from pydantic_settings import (
     BaseSettings,
     NoDecode,
@@ -25,6 +25,7 @@ from service.option_limits import FALSE_ACCEPT_RATE, LEAST_FALSE_ACCEPT_RATE
 from service.retrieval.encoder import Provider
 from service.runtime.environment import CLIENT_KEY, CONFIG, did_you_mean, require_known, setting_names
 from service.runtime.readable import why_unreadable
+from service.runtime.seal import LEAST_KEY
 
 _LABEL = r"[a-z0-9_]([a-z0-9_-]{0,61}[a-z0-9_])?"
 _HOST_PATTERN = re.compile(rf"\*|(\*\.)?{_LABEL}(\.{_LABEL})*")
@@ -148,6 +149,12 @@ class Settings(BaseSettings):
         lt=1,
         description="largest share of out-of-map queries with status LOCALIZED. A higher rate than the default also accepts a "
         "confidence below 0.9",
+    )
+    belief_key: SecretStr | None = Field(
+        None,
+        min_length=LEAST_KEY,
+        description=f"secret of {LEAST_KEY} characters or more that seals the belief which clients carry between requests; the same in "
+        "all replicas. By default the service draws one, and a belief ends with the service",
     )
     console: bool = Field(True, description="serve the browser console at /console, and its endpoints")
     samples: Path | None = Field(

@@ -61,6 +61,19 @@ class Refined:
         """The best supported candidate."""
         return self.candidates[0]
 
+    def led_by(self, T_map_camera: Transform) -> "Refined":
+        """Return the result with the candidate nearest to a pose as the best one.
+
+        Args:
+            T_map_camera: pose of one of the candidates that exclude each other.
+        """
+        found = self.candidates
+        nearest = min(_distinct(found), key=lambda k: math.dist(found[k].T_map_camera[:3, 3], T_map_camera[:3, 3]))
+        first = found[nearest]
+        covariance = self.covariance_at(first) if first.covariance is None else first.covariance
+        others = (candidate for k, candidate in enumerate(found) if k != nearest)
+        return replace(self, candidates=(replace(first, covariance=covariance), *others), covariance=covariance)
+
     def with_covariances(self) -> tuple[Candidate, ...]:
         """Return all candidates, with a covariance for each of those that exclude each other.
 

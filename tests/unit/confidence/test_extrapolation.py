@@ -3,7 +3,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from service.confidence.decision import outcome_of
+from service.confidence.decision import decision_of, outcome_of
 from service.confidence.extrapolation import MARGIN, extrapolated
 from service.confidence.features import FEATURES
 from service.confidence.spread import Extent
@@ -88,7 +88,9 @@ def test_an_extrapolated_answer_is_localized_only_at_a_higher_rate_than_the_defa
     camera = PinholeCamera(4, 4, 4.0, 4.0, 1.5, 1.5)
     query = Query(rgb=np.zeros((4, 4, 3), np.uint8), depth_m=image, camera=camera, false_accept_rate=rate)
     calibration = calibration_with("far", bias=bias)
-    found = outcome_of(calibration, query, None, evidence_of(far=5.0), frames=1, extent=Extent(np.zeros(3), np.eye(3)))
+    evidence = evidence_of(far=5.0)
+    decision = decision_of(calibration, query, None, evidence)
+    found = outcome_of(calibration, query, None, evidence, decision, frames=1, extent=Extent(np.zeros(3), np.eye(3)))
     assert found.extrapolated == (("far", 5.0),)
     assert found.threshold == calibration.threshold_at(rate)
     assert found.status == status

@@ -218,7 +218,7 @@ def test_an_uncertain_answer_is_a_problem_in_a_format_without_uncertainty(
     from service.confidence import decision
     from service.confidence.decision import Decision
 
-    monkeypatch.setattr(decision, "decide", lambda *_, **__: Decision("AMBIGUOUS", 0.4))
+    monkeypatch.setattr(decision, "decide", lambda *_, **__: Decision("AMBIGUOUS", 0.4, 0.4))
     monkeypatch.setattr(MapBundle, "calibration", calibration_of(), raising=False)
     refused = post(client, parts_of(), Accept="application/geopose+json")
     assert (refused.status_code, refused.json()["code"]) == (404, "no-pose")

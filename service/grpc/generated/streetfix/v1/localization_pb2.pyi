@@ -75,7 +75,7 @@ STREET_SECTION_BEGINNING: StreetSection
 STREET_SECTION_END: StreetSection
 
 class LocalizeRequest(_message.Message):
-    __slots__ = ("map", "rgb", "depth", "camera", "depth_format", "gravity", "vehicle_from_camera", "options", "prior", "vehicle_base_on_ground")
+    __slots__ = ("map", "rgb", "depth", "camera", "depth_format", "gravity", "vehicle_from_camera", "options", "prior", "vehicle_base_on_ground", "track")
     MAP_FIELD_NUMBER: _ClassVar[int]
     RGB_FIELD_NUMBER: _ClassVar[int]
     DEPTH_FIELD_NUMBER: _ClassVar[int]
@@ -86,6 +86,7 @@ class LocalizeRequest(_message.Message):
     OPTIONS_FIELD_NUMBER: _ClassVar[int]
     PRIOR_FIELD_NUMBER: _ClassVar[int]
     VEHICLE_BASE_ON_GROUND_FIELD_NUMBER: _ClassVar[int]
+    TRACK_FIELD_NUMBER: _ClassVar[int]
     map: str
     rgb: bytes
     depth: bytes
@@ -96,7 +97,16 @@ class LocalizeRequest(_message.Message):
     options: Options
     prior: Prior
     vehicle_base_on_ground: bool
-    def __init__(self, map: _Optional[str] = ..., rgb: _Optional[bytes] = ..., depth: _Optional[bytes] = ..., camera: _Optional[_Union[Camera, _Mapping]] = ..., depth_format: _Optional[_Union[DepthFormat, _Mapping]] = ..., gravity: _Optional[_Union[Vector3, _Mapping]] = ..., vehicle_from_camera: _Optional[_Union[RigidTransform, _Mapping]] = ..., options: _Optional[_Union[Options, _Mapping]] = ..., prior: _Optional[_Union[Prior, _Mapping]] = ..., vehicle_base_on_ground: _Optional[bool] = ...) -> None: ...
+    track: Track
+    def __init__(self, map: _Optional[str] = ..., rgb: _Optional[bytes] = ..., depth: _Optional[bytes] = ..., camera: _Optional[_Union[Camera, _Mapping]] = ..., depth_format: _Optional[_Union[DepthFormat, _Mapping]] = ..., gravity: _Optional[_Union[Vector3, _Mapping]] = ..., vehicle_from_camera: _Optional[_Union[RigidTransform, _Mapping]] = ..., options: _Optional[_Union[Options, _Mapping]] = ..., prior: _Optional[_Union[Prior, _Mapping]] = ..., vehicle_base_on_ground: _Optional[bool] = ..., track: _Optional[_Union[Track, _Mapping]] = ...) -> None: ...
+
+class Track(_message.Message):
+    __slots__ = ("belief", "previous_from_camera")
+    BELIEF_FIELD_NUMBER: _ClassVar[int]
+    PREVIOUS_FROM_CAMERA_FIELD_NUMBER: _ClassVar[int]
+    belief: str
+    previous_from_camera: RigidTransform
+    def __init__(self, belief: _Optional[str] = ..., previous_from_camera: _Optional[_Union[RigidTransform, _Mapping]] = ...) -> None: ...
 
 class LocalizeBatchRequest(_message.Message):
     __slots__ = ("requests",)
@@ -325,7 +335,7 @@ class Options(_message.Message):
     def __init__(self, neighbours: _Optional[int] = ..., refine: _Optional[bool] = ..., false_accept_rate: _Optional[float] = ...) -> None: ...
 
 class LocalizeResponse(_message.Message):
-    __slots__ = ("status", "confidence", "street", "pose", "vehicle_pose", "geopose", "neighbours", "map", "timings", "hypotheses", "spread", "reasons", "camera_height", "calibration", "extrapolated", "threshold")
+    __slots__ = ("status", "confidence", "street", "pose", "vehicle_pose", "geopose", "neighbours", "map", "timings", "hypotheses", "spread", "reasons", "camera_height", "calibration", "extrapolated", "threshold", "belief")
     class ExtrapolatedEntry(_message.Message):
         __slots__ = ("key", "value")
         KEY_FIELD_NUMBER: _ClassVar[int]
@@ -349,6 +359,7 @@ class LocalizeResponse(_message.Message):
     CALIBRATION_FIELD_NUMBER: _ClassVar[int]
     EXTRAPOLATED_FIELD_NUMBER: _ClassVar[int]
     THRESHOLD_FIELD_NUMBER: _ClassVar[int]
+    BELIEF_FIELD_NUMBER: _ClassVar[int]
     status: LocalizationStatus
     confidence: float
     street: Street
@@ -365,7 +376,34 @@ class LocalizeResponse(_message.Message):
     calibration: CalibrationRange
     extrapolated: _containers.ScalarMap[str, float]
     threshold: AcceptanceThreshold
-    def __init__(self, status: _Optional[_Union[LocalizationStatus, str]] = ..., confidence: _Optional[float] = ..., street: _Optional[_Union[Street, _Mapping]] = ..., pose: _Optional[_Union[Pose, _Mapping]] = ..., vehicle_pose: _Optional[_Union[Pose, _Mapping]] = ..., geopose: _Optional[_Union[GeoPose, _Mapping]] = ..., neighbours: _Optional[_Iterable[_Union[Neighbour, _Mapping]]] = ..., map: _Optional[_Union[MapVersion, _Mapping]] = ..., timings: _Optional[_Union[Timings, _Mapping]] = ..., hypotheses: _Optional[_Iterable[_Union[Hypothesis, _Mapping]]] = ..., spread: _Optional[_Union[Spread, _Mapping]] = ..., reasons: _Optional[_Iterable[_Union[Reason, _Mapping]]] = ..., camera_height: _Optional[_Union[CameraHeight, _Mapping]] = ..., calibration: _Optional[_Union[CalibrationRange, str]] = ..., extrapolated: _Optional[_Mapping[str, float]] = ..., threshold: _Optional[_Union[AcceptanceThreshold, _Mapping]] = ...) -> None: ...
+    belief: Belief
+    def __init__(self, status: _Optional[_Union[LocalizationStatus, str]] = ..., confidence: _Optional[float] = ..., street: _Optional[_Union[Street, _Mapping]] = ..., pose: _Optional[_Union[Pose, _Mapping]] = ..., vehicle_pose: _Optional[_Union[Pose, _Mapping]] = ..., geopose: _Optional[_Union[GeoPose, _Mapping]] = ..., neighbours: _Optional[_Iterable[_Union[Neighbour, _Mapping]]] = ..., map: _Optional[_Union[MapVersion, _Mapping]] = ..., timings: _Optional[_Union[Timings, _Mapping]] = ..., hypotheses: _Optional[_Iterable[_Union[Hypothesis, _Mapping]]] = ..., spread: _Optional[_Union[Spread, _Mapping]] = ..., reasons: _Optional[_Iterable[_Union[Reason, _Mapping]]] = ..., camera_height: _Optional[_Union[CameraHeight, _Mapping]] = ..., calibration: _Optional[_Union[CalibrationRange, str]] = ..., extrapolated: _Optional[_Mapping[str, float]] = ..., threshold: _Optional[_Union[AcceptanceThreshold, _Mapping]] = ..., belief: _Optional[_Union[Belief, _Mapping]] = ...) -> None: ...
+
+class Belief(_message.Message):
+    __slots__ = ("epoch", "modes", "elsewhere", "outside", "token")
+    EPOCH_FIELD_NUMBER: _ClassVar[int]
+    MODES_FIELD_NUMBER: _ClassVar[int]
+    ELSEWHERE_FIELD_NUMBER: _ClassVar[int]
+    OUTSIDE_FIELD_NUMBER: _ClassVar[int]
+    TOKEN_FIELD_NUMBER: _ClassVar[int]
+    epoch: int
+    modes: _containers.RepeatedCompositeFieldContainer[Mode]
+    elsewhere: float
+    outside: float
+    token: str
+    def __init__(self, epoch: _Optional[int] = ..., modes: _Optional[_Iterable[_Union[Mode, _Mapping]]] = ..., elsewhere: _Optional[float] = ..., outside: _Optional[float] = ..., token: _Optional[str] = ...) -> None: ...
+
+class Mode(_message.Message):
+    __slots__ = ("pose", "weight", "number", "unseen")
+    POSE_FIELD_NUMBER: _ClassVar[int]
+    WEIGHT_FIELD_NUMBER: _ClassVar[int]
+    NUMBER_FIELD_NUMBER: _ClassVar[int]
+    UNSEEN_FIELD_NUMBER: _ClassVar[int]
+    pose: Pose
+    weight: float
+    number: int
+    unseen: int
+    def __init__(self, pose: _Optional[_Union[Pose, _Mapping]] = ..., weight: _Optional[float] = ..., number: _Optional[int] = ..., unseen: _Optional[int] = ...) -> None: ...
 
 class AcceptanceThreshold(_message.Message):
     __slots__ = ("confidence", "false_accept_rate")

@@ -1,0 +1,268 @@
+"""Belief of a moving robot: a Bayes filter over a few modes, with the odometry between the frames.
+
+Each frame is registered alone. Its candidates, their shares of the support and the calibrated confidence give a probability to each
+candidate, to the other places of the map, and to the outside. The filter multiplies them with the belief, which the odometry has moved.
+It is a Gaussian mixture filter with several hypotheses (Thrun, Burgard and Fox, Probabilistic Robotics, 2005, section 7.4) and an
+explicit probability for everything outside the modes.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Float64
+from numpy.typing import NDArray
+
+from service.geometry.rigid import Transform, heading_of_camera, nearest_rigid
+from service.geometry.uncertainty import covariance_at
+
+#: Largest number of modes. The weakest ones return to the rest of the map.
+MOST_MODES = 8
+#: Modes with less weight return to the rest of the map.
+LEAST_WEIGHT = 1e-4
+#: Probability that somebody carries the robot to another place, per frame.
+KIDNAPPED = 0.01
+#: Standard deviation of odometry: share of the distance, metres at least, share of the angle, and radians at least.
+ODOMETRY_STD = (0.03, 0.02, 0.03, float(np.deg2rad(0.2)))
+#: Number of places that wrong candidates of consecutive frames are spread over. Errors repeat, because a perceptual alias moves along
+#: with the robot. So it is far below the number of places of the map.
+ALTERNATIVES = 2.0
+#: Least probability, as a share of being in the map, that no candidate of a frame is right.
+MISSED = 0.02
+#: Least probability of a frame that the camera is in the map, and that it is outside. No single frame is surer.
+LEAST_PROBABILITY = 1e-4
+#: A candidate agrees with a mode within this distance and angle. Three standard deviations of the mode are added to the distance.
+AGREES_M, AGREES_RAD = 1.0, float(np.deg2rad(15.0))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Seen:
+    """A candidate of one frame.
+
+    Attributes:
+        T_map_camera: registered pose.
+        covariance: of it: translation (m), then rotation (rad), in map axes, about the camera.
+        probability: that the camera is there, from this frame alone, 0 to 1.
+        inliers: share of the depth weight that lies on the map, 0 to 1.
+        similarity: cosine similarity of the query to the places around.
+    """
+
+    T_map_camera: Transform
+    covariance: Float64[NDArray[np.float64], "6 6"]
+    probability: float
+    inliers: float
+    similarity: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Sighting:
+    """What one frame says alone.
+
+    Attributes:
+        candidates: poses that exclude each other.
+        elsewhere: probability that the camera is at another place of the map.
+        outside: probability that the camera is outside the map.
+    """
+
+    candidates: tuple[Seen, ...]
+    elsewhere: float
+    outside: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Mode:
+    """A pose that the camera may have.
+
+    Attributes:
+        T_map_camera: pose.
+        covariance: of it, if the mode is right.
+        weight: probability that the camera is within 1 m of it, 0 to 1. A mode that is ``unseen`` may have drifted farther.
+        number: identity of the mode; odometry does not change it.
+        inliers: inlier share of the last frame that agreed.
+        similarity: similarity of the last frame that agreed.
+        unseen: number of frames since one agreed.
+    """
+
+    T_map_camera: Transform
+    covariance: Float64[NDArray[np.float64], "6 6"]
+    weight: float
+    number: int
+    inliers: float
+    similarity: float
+    unseen: int = 0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Belief:
+    """Where a robot may be. The weights of the modes, ``elsewhere`` and ``outside`` sum to 1.
+
+    Attributes:
+        modes: the heaviest first.
+        elsewhere: probability of all other places of the map.
+        outside: probability of a place outside the map.
+        born: number of modes so far.
+    """
+
+    modes: tuple[Mode, ...] = ()
+    elsewhere: float = 0.5
+    outside: float = 0.5
+    born: int = 0
+
+    def moved(self, T_previous_camera: Transform, *, kidnapped: float = KIDNAPPED) -> "Belief":
+        """Return the belief after a motion.
+
+        Args:
+            T_previous_camera: odometry, from this camera's frame to the previous camera's frame, metres.
+            kidnapped: probability that the odometry missed a displacement. Then the robot is in the map or outside, equally likely.
+        """
+        stays = 1.0 - kidnapped
+        modes = tuple(replace(moved(mode, T_previous_camera), weight=stays * mode.weight) for mode in self.modes)
+        elsewhere, outside = (stays * each + kidnapped / 2 for each in (self.elsewhere, self.outside))
+        return replace(self, modes=modes, elsewhere=elsewhere, outside=outside)
+
+    def seen(self, sighting: Sighting, *, alternatives: float = ALTERNATIVES) -> "Belief":
+        """Return the belief after a frame.
+
+        Args:
+            sighting: what the frame says alone.
+            alternatives: number of places that wrong candidates of consecutive frames are spread over.
+        """
+        partner = _pairs(self.modes, sighting.candidates)
+        modes, born = [], self.born
+        for k, mode in enumerate(self.modes):
+            found = sighting.candidates[partner[k]] if k in partner else None
+            if found is None or alternatives * found.probability < sighting.elsewhere:
+                modes.append(replace(mode, weight=mode.weight * sighting.elsewhere, unseen=mode.unseen + 1))
+                continue
+            modes.append(
+                replace(
+                    mode,
+                    T_map_camera=found.T_map_camera,
+                    covariance=found.covariance,
+                    weight=mode.weight * alternatives * found.probability,
+                    inliers=found.inliers,
+                    similarity=found.similarity,
+                    unseen=0,
+                )
+            )
+        for j, found in enumerate(sighting.candidates):
+            if j in partner.values():
+                continue
+            modes.append(
+                Mode(
+                    found.T_map_camera,
+                    found.covariance,
+                    self.elsewhere * found.probability,
+                    born,
+                    found.inliers,
+                    found.similarity,
+                )
+            )
+            born += 1
+        return _normalised(modes, self.elsewhere * sighting.elsewhere, self.outside * sighting.outside, born)
+
+    def raised(self, seen: Seen) -> "Belief":
+        """Return the belief after an answer of several frames together: its pose has at least the probability of the answer.
+
+        The answer uses frames that the belief knows already, so it is no further evidence.
+
+        Args:
+            seen: pose and probability of the answer.
+        """
+        here = next((k for k, mode in enumerate(self.modes) if agrees(mode, seen.T_map_camera)), None)
+        weight = 0.0 if here is None else self.modes[here].weight
+        if seen.probability <= weight:
+            return self
+        number, born = (self.born, self.born + 1) if here is None else (self.modes[here].number, self.born)
+        raised = Mode(seen.T_map_camera, seen.covariance, seen.probability, number, seen.inliers, seen.similarity)
+        less = (1.0 - seen.probability) / (1.0 - weight)
+        others = [replace(mode, weight=less * mode.weight) for k, mode in enumerate(self.modes) if k != here]
+        return _normalised([raised, *others], less * self.elsewhere, less * self.outside, born)
+
+    def unseen(self) -> "Belief":
+        """Return the belief after a frame that says nothing, for example because a vehicle covers it."""
+        return replace(self, modes=tuple(replace(mode, unseen=mode.unseen + 1) for mode in self.modes))
+
+
+def sighting_of(
+    candidates: Sequence[Seen], shares: Float64[NDArray[np.float64], " C"], confidence: float, known: float
+) -> Sighting:
+    """Distribute the probability of one frame over its candidates, the rest of the map, and the outside.
+
+    The first candidate has the calibrated confidence. If it does not hold the majority of the support, it has at most its share, because
+    then look-alikes compete with it. The others have the rest in proportion to their shares (as ``confidence.spread.spread_of``).
+
+    Args:
+        candidates: poses that exclude each other, the best supported first; their ``probability`` is not read.
+        shares: share of each in the support, 0 to 1.
+        confidence: probability that the first one is within 1 m.
+        known: probability that the camera is in the map.
+    """
+    known = min(max(known, LEAST_PROBABILITY), 1.0 - LEAST_PROBABILITY)
+    if not candidates:
+        return Sighting((), known, 1.0 - known)
+    first = min(confidence, known) if shares[0] > 0.5 else min(confidence, float(shares[0]) * known)
+    most = (1.0 - MISSED) * known
+    first = min(first, most)
+    total = min(most, max(first, confidence / float(shares[0])))
+    rest = float(shares[1:].sum())
+    each = np.array([first, *((total - first) * shares[1:] / rest if rest > 0 else shares[1:] * 0.0)])
+    seen = tuple(replace(one, probability=float(p)) for one, p in zip(candidates, each, strict=True))
+    return Sighting(seen, known - float(each.sum()), 1.0 - known)
+
+
+def _motion_covariance(T_previous_camera: Transform) -> Float64[NDArray[np.float64], "6 6"]:
+    """Return the covariance of an odometry step: equal in all directions."""
+    share, least_m, angle_share, least_rad = ODOMETRY_STD
+    distance_m = float(np.linalg.norm(T_previous_camera[:3, 3]))
+    angle = float(np.arccos(np.clip((np.trace(T_previous_camera[:3, :3]) - 1) / 2, -1, 1)))
+    position, rotation = least_m + share * distance_m, least_rad + angle_share * angle
+    return np.diag([position**2] * 3 + [rotation**2] * 3)
+
+
+def moved(mode: Mode, T_previous_camera: Transform) -> Mode:
+    """Return a mode after a motion, with the same weight.
+
+    Args:
+        mode: the mode.
+        T_previous_camera: odometry, from this camera's frame to the previous camera's frame, metres.
+    """
+    T = nearest_rigid(mode.T_map_camera @ T_previous_camera)
+    carried = covariance_at(mode.covariance, mode.T_map_camera[:3, 3], T[:3, 3])
+    return replace(mode, T_map_camera=T, covariance=carried + _motion_covariance(T_previous_camera))
+
+
+def agrees(mode: Mode, T_map_camera: Transform) -> bool:
+    """Return whether a pose may be that of a mode.
+
+    Args:
+        mode: the mode.
+        T_map_camera: pose.
+    """
+    away_m = float(np.hypot(*(T_map_camera[:2, 3] - mode.T_map_camera[:2, 3])))
+    turned = heading_of_camera(T_map_camera) - heading_of_camera(mode.T_map_camera)
+    deviation_m = float(np.sqrt(np.linalg.eigvalsh(mode.covariance[:2, :2])[-1]))
+    return away_m <= AGREES_M + 3.0 * deviation_m and bool(np.cos(turned) >= np.cos(AGREES_RAD))
+
+
+def _pairs(modes: Sequence[Mode], candidates: Sequence[Seen]) -> dict[int, int]:
+    """Assign candidates to modes that they agree with, the nearest first."""
+    near = [
+        (float(np.hypot(*(one.T_map_camera[:2, 3] - mode.T_map_camera[:2, 3]))), k, j)
+        for k, mode in enumerate(modes)
+        for j, one in enumerate(candidates)
+        if agrees(mode, one.T_map_camera)
+    ]
+    taken: dict[int, int] = {}
+    for _, k, j in sorted(near):
+        if k not in taken and j not in taken.values():
+            taken[k] = j
+    return taken
+
+
+def _normalised(modes: list[Mode], elsewhere: float, outside: float, born: int) -> Belief:
+    total = sum(mode.weight for mode in modes) + elsewhere + outside
+    modes = sorted((replace(mode, weight=mode.weight / total) for mode in modes), key=lambda mode: -mode.weight)
+    kept = tuple(mode for mode in modes[:MOST_MODES] if mode.weight >= LEAST_WEIGHT)
+    outside = outside / total
+    return Belief(kept, max(0.0, 1.0 - outside - sum(mode.weight for mode in kept)), outside, born)

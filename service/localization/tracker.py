@@ -1,0 +1,169 @@
+"""Follow a robot over its frames: each frame alone first, then the last frames together, and a belief over all of them."""
+
+from dataclasses import dataclass, field, replace
+from functools import partial
+
+import numpy as np
+from jaxtyping import Float64
+from numpy.typing import NDArray
+
+from service.confidence.decision import Decision
+from service.confidence.extrapolation import extrapolated
+from service.geometry.rigid import Transform, inverse, nearest_rigid
+from service.localization.answer import Answer
+from service.localization.belief import Belief, Mode, Seen, agrees, moved, sighting_of
+from service.localization.localizer import Found, Localizer
+from service.option_limits import FALSE_ACCEPT_RATE
+from service.retrieval.frame import Frame
+from service.scoring.candidates import RIVAL_M, Candidate, distinct_candidates, shares_of
+from service.timing import StageTimer
+
+#: Maximum number of frames that are registered together. Five frames resolve a street of repeating blocks (decision log).
+MOST_FRAMES = 5
+#: An answer is not accepted if its rivals leave it this probability or less.
+CONTRADICTED = 0.5
+#: Number of modes whose predicted poses are starts of the registration.
+PREDICTED = 4
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Track:
+    """What is known about a robot between two frames.
+
+    Attributes:
+        belief: where it may be.
+        epoch: number of disruptions so far. A client that compares it with the last answer's knows whether poses before still hold.
+        last: pose of the last LOCALIZED answer, moved by the odometry since; None before the first one.
+        frames: the last frames, the newest first; their poses are relative to the newest.
+    """
+
+    belief: Belief = field(default_factory=Belief)
+    epoch: int = 0
+    last: Mode | None = None
+    frames: tuple[Frame, ...] = ()
+
+    def broken(self) -> "Track":
+        """Return the track after a frame whose odometry is unknown: nothing is left but the count of disruptions."""
+        return Track(epoch=self.epoch + int(self.last is not None))
+
+
+def follow(
+    localizer: Localizer, frame: Frame, track: Track, T_previous_camera: Transform | None, timer: StageTimer
+) -> tuple[Answer, Track]:
+    """Answer the next frame of a robot.
+
+    1. The frame is registered alone. The modes of the belief are starts too.
+    2. The belief moves by the odometry, and takes what the frame says.
+    3. If another mode overtakes the one that the robot was at, the robot was displaced. The frames before no longer count.
+    4. The answer comes from the frame alone, from the last frames together, or from the belief: the first that is LOCALIZED and that
+       nothing contradicts. If it is at another mode than the last LOCALIZED answer, the epoch rises.
+
+    Args:
+        localizer: of the map.
+        frame: as from ``Localizer.look_up``.
+        track: of the frames before; ``Track()`` begins.
+        T_previous_camera: odometry, from this camera's frame to the previous camera's frame, metres. None: unknown; the track begins
+            again.
+        timer: of the request.
+
+    Returns:
+        The answer with its ``belief`` and ``epoch``, and the track for the next frame.
+
+    Raises:
+        RequestError: the calibration does not support such a low false-accept rate.
+        NotFiniteError: a number of the answer is not finite, because of a defect of this program or of the map.
+    """
+    if T_previous_camera is None:
+        track, kept, belief, last = track.broken(), tuple[Frame, ...](), Belief(), None
+    else:
+        back = inverse(T_previous_camera)
+        kept = tuple(
+            replace(each, T_reference_camera=nearest_rigid(back @ each.T_reference_camera)) for each in track.frames
+        )
+        belief = track.belief.moved(T_previous_camera)
+        last = None if track.last is None else moved(track.last, T_previous_camera)
+    if not localizer.decides(frame.query):  # there is no probability to believe
+        frames = (frame, *kept)
+        return localizer.answer(frames, timer), Track(frames=frames[: MOST_FRAMES - 1], epoch=track.epoch)
+    predicted = tuple(mode.T_map_camera for mode in belief.modes[:PREDICTED])
+    alone = localizer.register((frame,), timer, predicted)
+    with timer.stage("register"):
+        belief = _believed(localizer, frame, alone, belief)
+    if _is_overtaken(last, belief):
+        kept = ()
+    answer = _answer(localizer, (frame, *kept), alone, belief, timer)
+    epoch = track.epoch
+    if answer.status == "LOCALIZED" and answer.candidates and answer.covariance is not None:
+        found = _seen(answer.candidates[0], answer.covariance, probability=answer.confidence or 0.0)
+        epoch += int(last is not None and not agrees(last, found.T_map_camera))
+        belief = belief.raised(found)
+        last = Mode(found.T_map_camera, found.covariance, found.probability, 0, found.inliers, found.similarity)
+    following = Track(belief, epoch, last, (frame, *kept)[: MOST_FRAMES - 1])
+    return replace(answer, belief=belief, epoch=epoch), following
+
+
+def _is_overtaken(last: Mode | None, belief: Belief) -> bool:
+    """Return whether a mode elsewhere is likelier than the pose of the last LOCALIZED answer, and than all places without a mode."""
+    if last is None or not belief.modes:
+        return False
+    first = belief.modes[0]
+    return not agrees(last, first.T_map_camera) and first.weight > max(belief.elsewhere, belief.outside)
+
+
+def _believed(localizer: Localizer, frame: Frame, alone: Found, belief: Belief) -> Belief:
+    """Return the belief after a frame. A frame outside the range of the calibration says nothing at the default false-accept rate."""
+    calibration, decision = localizer.bundle.calibration, alone.decision
+    if alone.refined is None or calibration is None or decision is None:
+        return belief.unseen()
+    if frame.query.false_accept_rate <= FALSE_ACCEPT_RATE and extrapolated(calibration, alone.evidence):
+        return belief.unseen()
+    candidates = distinct_candidates(alone.refined.with_covariances())
+    seen = [_seen(each, each.covariance) for each in candidates if each.covariance is not None]
+    return belief.seen(sighting_of(seen, shares_of(candidates, 1), decision.confidence, decision.known))
+
+
+def _seen(candidate: Candidate, covariance: Float64[NDArray[np.float64], "6 6"], *, probability: float = 0.0) -> Seen:
+    inliers, similarity = candidate.registered.inliers, candidate.scores["similarity"]
+    return Seen(candidate.T_map_camera, covariance, probability, inliers, similarity)
+
+
+def _answer(localizer: Localizer, frames: tuple[Frame, ...], alone: Found, belief: Belief, timer: StageTimer) -> Answer:
+    """Build the answer from the frame alone, else from all frames together, else from the belief: the first that is accepted."""
+    ceiling = partial(_ceiling, alone=alone, belief=belief)
+    if _is_localized(alone) and ceiling(alone) > CONTRADICTED:
+        return localizer.compose(frames[:1], alone, timer)
+    found, used = alone, frames[:1]
+    if len(frames) > 1:
+        found, used = localizer.register(frames, timer), frames
+        if _is_localized(found) and ceiling(found) > CONTRADICTED:
+            return localizer.compose(frames, found, timer)
+    calibration, mode = localizer.bundle.calibration, belief.modes[0] if belief.modes else None
+    if calibration is not None and alone.refined is not None and mode is not None and mode.unseen == 0:
+        accepted = Decision("LOCALIZED", mode.weight, 1.0 - belief.outside)
+        if mode.weight >= calibration.threshold(frames[0].query.false_accept_rate):
+            refined = alone.refined.led_by(mode.T_map_camera)
+            return localizer.compose(frames[:1], replace(alone, refined=refined, decision=accepted), timer)
+    if found.decision is not None and found.decision.status == "LOCALIZED":
+        doubted = Decision("AMBIGUOUS", min(found.decision.confidence, ceiling(found)), found.decision.known)
+        found = replace(found, decision=doubted)
+    return localizer.compose(used, found, timer)
+
+
+def _is_localized(found: Found) -> bool:
+    return found.decision is not None and found.decision.status == "LOCALIZED"
+
+
+def _ceiling(found: Found, alone: Found, belief: Belief) -> float:
+    """Return an upper limit of the probability of an answer: what its rivals in the belief and in the newest frame leave.
+
+    Frames from before a displacement may outvote the newest frame.
+    """
+    if found.refined is None or alone.refined is None or alone.decision is None:
+        return 0.0
+    T = found.refined.best.T_map_camera
+    here = sum(mode.weight for mode in belief.modes if agrees(mode, T))
+    rival = max((mode.weight for mode in belief.modes if not agrees(mode, T)), default=0.0)
+    left = here / (here + rival) if rival > 0 else 1.0
+    best = alone.refined.best.T_map_camera
+    is_same = float(np.linalg.norm(best[:3, 3] - T[:3, 3])) <= RIVAL_M
+    return left if is_same else min(left, 1.0 - alone.decision.confidence)

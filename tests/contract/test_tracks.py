@@ -1,0 +1,225 @@
+"""A robot's track over both faces: a client that carries the belief, and a stream that keeps it. Over real sockets."""
+
+import base64
+import json
+import threading
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import grpc
+import httpx
+import numpy as np
+import pytest
+import uvicorn
+
+from service.client import Client, GrpcClient, PinholeCamera, RefusedError, Track
+from service.confidence.features import FEATURES
+from service.contract.schema import MOST_TOKEN
+from service.grpc.generated.streetfix.v1 import localization_pb2 as pb
+from service.grpc.generated.streetfix.v1.localization_pb2_grpc import LocalizationServiceStub
+from service.grpc.server import GrpcServer
+from service.http.app import create_app
+from service.localization.track_bytes import MOST_BYTES
+from service.maps.content import BundleContent
+from service.maps.writer import write_bundle
+from service.runtime.engine import Engine
+from service.runtime.settings import Settings
+
+Parts = Callable[..., dict[str, bytes]]
+CAMERA = pb.Camera(width=64, height=48, fx=32, fy=32, cx=31.5, cy=23.5)
+DEPTH = pb.DepthFormat(scale_m=1)
+STAY = {"position": {"x": 0.0, "y": 0.0, "z": 0.0}, "orientation": {"x": 0.0, "y": 0.0, "z": 0.0, "w": 1.0}}
+#: Confidence and probability of being in the map that the calibration gives to every answer. The threshold is 0.9.
+RIGHT, KNOWN, THRESHOLD = 0.7, 0.95, 0.9
+
+
+def log_odds(probability: float) -> float:
+    return float(np.log(probability / (1 - probability)))
+
+
+def calibration() -> dict[str, Any]:
+    """A calibration with one confidence for all answers, and no evidence out of range."""
+    return {
+        "calibrated": True,
+        "features": [{"name": name, "mean": 0.0, "std": 1e6} for name in FEATURES],
+        "right": {"terms": [], "bias": log_odds(RIGHT)},
+        "known": {"terms": [], "bias": log_odds(KNOWN)},
+        "thresholds": [{"false_accept_rate": 0.01, "confidence": THRESHOLD}],
+        "site": None,
+        "measured_on": {"cities": "none", "queries": 0},
+    }
+
+
+@pytest.fixture(scope="module")
+def faces(
+    content_of: Callable[..., BundleContent], tmp_path_factory: pytest.TempPathFactory
+) -> Iterator[tuple[httpx.Client, LocalizationServiceStub, str]]:
+    """REST, gRPC, and the address of gRPC, on one engine."""
+    folder: Path = tmp_path_factory.mktemp("tracks") / "tiny"
+    write_bundle(folder, content_of(calibration=calibration()))
+    engine = Engine.open(Settings(maps=(folder,), threads=1, queue=16))
+    server = uvicorn.Server(uvicorn.Config(create_app(engine), port=0, log_config=None, lifespan="off"))
+    thread = threading.Thread(target=server.run)
+    thread.start()
+    while not server.started:
+        assert thread.is_alive()
+    port = server.servers[0].sockets[0].getsockname()[1]
+    grpc_server = GrpcServer(engine, host="127.0.0.1", port=0)
+    grpc_server.start()
+    with (
+        grpc.insecure_channel(f"127.0.0.1:{grpc_server.port}") as channel,
+        httpx.Client(base_url=f"http://127.0.0.1:{port}") as client,
+    ):
+        yield client, LocalizationServiceStub(channel), f"127.0.0.1:{grpc_server.port}"
+    grpc_server.stop(grace_s=1)
+    server.should_exit = True
+    thread.join()
+    engine.close()
+
+
+def posted(client: httpx.Client, parts: dict[str, bytes]) -> httpx.Response:
+    return client.post("/v1/localize", files={name: (name, data) for name, data in parts.items()})
+
+
+def message_of(parts: dict[str, bytes], **track: Any) -> pb.LocalizeRequest:
+    return pb.LocalizeRequest(
+        rgb=parts["rgb"], depth=parts["depth"], camera=CAMERA, depth_format=DEPTH, track=pb.Track(**track)
+    )
+
+
+def test_frames_that_agree_become_localized(faces: Any, parts_of: Parts) -> None:
+    """One frame has a confidence of 0.7, below the threshold. Two frames at one place have more."""
+    client, _, _ = faces
+    alone = posted(client, parts_of()).json()
+    assert (alone["status"], alone["belief"]) == ("AMBIGUOUS", None)
+    first = posted(client, parts_of(track={})).json()
+    assert (first["status"], first["confidence"]) == ("AMBIGUOUS", pytest.approx(RIGHT))
+    belief = first["belief"]
+    assert belief["epoch"] == 0
+    assert belief["modes"][0]["weight"] == pytest.approx(RIGHT)
+    assert sum(mode["weight"] for mode in belief["modes"]) + belief["elsewhere"] + belief["outside"] == pytest.approx(1)
+    second = posted(client, parts_of(track={"belief": belief["token"], "T_previous_camera": STAY})).json()
+    assert second["status"] == "LOCALIZED"
+    assert second["confidence"] > THRESHOLD
+    assert second["belief"]["modes"][0]["number"] == belief["modes"][0]["number"]
+    assert second["pose"]["position"] == second["hypotheses"][0]["pose"]["position"]
+    assert (second["spread"], second["hypotheses"][0]["confirmed"]) == (None, True)
+
+
+def test_unknown_odometry_begins_an_epoch_once_the_robot_was_localized(faces: Any, parts_of: Parts) -> None:
+    client, _, _ = faces
+    answer = posted(client, parts_of(track={})).json()
+    for _ in range(2):
+        track = {"belief": answer["belief"]["token"], "T_previous_camera": STAY}
+        answer = posted(client, parts_of(track=track)).json()
+    assert (answer["status"], answer["belief"]["epoch"]) == ("LOCALIZED", 0)
+    lost = posted(client, parts_of(track={"belief": answer["belief"]["token"]})).json()
+    assert (lost["status"], lost["belief"]["epoch"]) == ("AMBIGUOUS", 1)
+
+
+def test_both_faces_continue_each_others_tracks(faces: Any, parts_of: Parts) -> None:
+    client, stub, _ = faces
+    parts = parts_of()
+    first = stub.Localize(message_of(parts)).belief
+    second = posted(client, parts_of(track={"belief": first.token, "T_previous_camera": STAY})).json()["belief"]
+    again = stub.Localize(message_of(parts, belief=first.token, previous_from_camera=STAY)).belief
+    assert [mode["weight"] for mode in second["modes"]] == pytest.approx([mode.weight for mode in again.modes])
+    assert (second["elsewhere"], second["outside"]) == pytest.approx((again.elsewhere, again.outside))
+    x = second["modes"][0]["pose"]["position"]["x"]
+    assert x == pytest.approx(again.modes[0].pose.position.x)
+    assert x == pytest.approx(20, abs=0.3)
+
+
+def test_a_stream_keeps_the_track_itself(faces: Any, parts_of: Parts) -> None:
+    _, stub, _ = faces
+    parts = parts_of()
+    frame = pb.LocalizeRequest(rgb=parts["rgb"], depth=parts["depth"], camera=CAMERA, depth_format=DEPTH)
+    steps = [pb.LocalizeStreamRequest(frame=frame, previous_from_camera=STAY if k else None) for k in range(3)]
+    answers = [each.outcome.answer for each in stub.LocalizeStream(iter(steps))]
+    assert [each.status for each in answers] == [
+        pb.LOCALIZATION_STATUS_AMBIGUOUS,
+        pb.LOCALIZATION_STATUS_LOCALIZED,
+        pb.LOCALIZATION_STATUS_LOCALIZED,
+    ]
+    assert not any(each.belief.HasField("token") for each in answers)
+    carried = stub.Localize(message_of(parts)).belief
+    assert answers[0].belief.modes[0].weight == pytest.approx(carried.modes[0].weight)
+
+
+def test_a_stream_refuses_a_carried_track_and_goes_on(faces: Any, parts_of: Parts) -> None:
+    _, stub, _ = faces
+    parts = parts_of()
+    plain = pb.LocalizeRequest(rgb=parts["rgb"], depth=parts["depth"], camera=CAMERA, depth_format=DEPTH)
+    requests = [pb.LocalizeStreamRequest(frame=each) for each in (message_of(parts), plain)]
+    refused, answered = list(stub.LocalizeStream(iter(requests)))
+    assert refused.outcome.problem.field == "frame 0.track"
+    assert "omit track" in refused.outcome.problem.detail
+    assert answered.outcome.HasField("answer")
+
+
+def changed(token: str) -> str:
+    content = bytearray(base64.urlsafe_b64decode(token + "=" * (-len(token) % 4)))
+    content[40] ^= 1
+    return base64.urlsafe_b64encode(content).rstrip(b"=").decode()
+
+
+@pytest.mark.parametrize(
+    ("spoil", "told"),
+    [
+        (changed, "does not come from this service"),
+        (lambda token: token[:-8], "does not come from this service"),
+        (lambda _: "", "does not come from this service"),
+        (lambda token: token + "=", "belief"),
+        (lambda token: token + "A" * (1 + (1 - len(token)) % 4), "belief"),
+        (lambda _: "A" * (MOST_TOKEN + 1), "belief"),
+    ],
+    ids=["changed", "cut", "empty", "padding", "no base64", "too long"],
+)
+def test_a_token_of_another_origin_is_refused(
+    faces: Any, parts_of: Parts, spoil: Callable[[str], str], told: str
+) -> None:
+    client, _, _ = faces
+    token = posted(client, parts_of(track={})).json()["belief"]["token"]
+    refused = posted(client, parts_of(track={"belief": spoil(token), "T_previous_camera": STAY}))
+    problem = refused.json()
+    assert (refused.status_code, problem["field"]) == (422, "track.belief")
+    assert told in problem["detail"]
+
+
+def test_the_longest_token_fits() -> None:
+    mac = 32
+    assert len(base64.urlsafe_b64encode(bytes(mac + MOST_BYTES))) <= MOST_TOKEN
+
+
+def test_the_clients_carry_a_track(faces: Any, pictures: Any) -> None:
+    client, _, address = faces
+    rgb, depth_m, camera = pictures
+    with Client(str(client.base_url)) as rest, GrpcClient(address) as remote:
+        for asking in (rest, remote):
+            first = asking.localize(rgb, depth_m, camera, track=Track())
+            second = asking.localize(rgb, depth_m, camera, track=Track(before=first, T_previous_camera=np.eye(4)))
+            assert [first.status, second.status] == ["AMBIGUOUS", "LOCALIZED"]
+            assert second.belief is not None
+            assert second.belief.modes[0].weight > THRESHOLD
+        with pytest.raises(RefusedError, match=r"track\.belief"):
+            rest.localize(
+                rgb, depth_m, camera, track=Track(before=first.model_copy(update={"belief": forged(first.belief)}))
+            )
+    assert isinstance(camera, PinholeCamera)
+
+
+def forged(belief: Any) -> Any:
+    return belief.model_copy(update={"token": "A" * 100})
+
+
+def test_a_batch_may_carry_tracks_and_a_sequence_may_not(faces: Any, parts_of: Parts) -> None:
+    client, _, _ = faces
+    parts = parts_of(track={})
+    request = json.loads(parts["request"])
+    pictures = {f"{name}0": (name, parts[name]) for name in ("rgb", "depth")}
+    batch = client.post("/v1/localize/batch", files=pictures | {"request": ("r", json.dumps({"requests": [request]}))})
+    assert batch.json()["outcomes"][0]["answer"]["belief"]["token"]
+    sequence = {"frames": [{name: request[name] for name in ("camera", "depth")}], "track": {}}
+    refused = client.post("/v1/localize/sequence", files=pictures | {"request": ("r", json.dumps(sequence))})
+    assert (refused.status_code, refused.json()["field"]) == (422, "track")

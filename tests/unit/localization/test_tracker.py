@@ -1,0 +1,212 @@
+"""Tracks with scripted registrations: each frame says where it may be, and with which confidence."""
+
+import math
+from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from service.confidence.decision import Decision, Status
+from service.geometry.rigid import transform_from
+from service.localization import tracker
+from service.localization.localizer import Found, Localizer
+from service.localization.track_bytes import MOST_BYTES, packed, unpacked
+from service.localization.tracker import MOST_FRAMES, Track, follow
+from service.maps.reader import MapBundle
+from service.registration.register import Registered
+from service.retrieval.frame import Frame
+from service.retrieval.query import Query
+from service.retrieval.retrieve import Retrieved
+from service.scoring.candidates import Candidate, Refined
+from service.timing import StageTimer
+
+LEVEL = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
+SMALL = np.diag([0.01**2] * 6)
+#: The camera drives 1 m ahead, along map x.
+AHEAD = transform_from(np.eye(3), np.array([0.0, 0.0, 1.0]))
+THRESHOLD = 0.9
+
+
+def candidate(x: float, support: float) -> Candidate:
+    registered = Registered(LEVEL, np.array([x, 0.0, 1.5]), 1.0, 0.0, 0.6, np.eye(8), 0)
+    T = transform_from(LEVEL, np.array([x, 0.0, 1.5]))
+    return Candidate(T, registered, {"similarity": 0.8}, support, SMALL)
+
+
+def found(confidence: float, *places: tuple[float, float], known: float | None = None) -> Found:
+    """Return a registration with candidates (x, share of the support)."""
+    candidates = tuple(candidate(x, math.log(share)) for x, share in places)
+    refined = Refined(candidates, SMALL, SMALL, 500, 1.0, lambda _: SMALL)
+    known = max(confidence, 0.98) if known is None else known
+    status: Status = "LOCALIZED" if confidence >= THRESHOLD and places[0][1] > 0.5 else "AMBIGUOUS"
+    return Found(Retrieved((), (), None), refined, np.zeros(1), Decision(status, confidence, known))
+
+
+class Scripted(Localizer):
+    """A localizer whose registrations are given: ``alone`` for each frame, and ``together`` for several of them."""
+
+    def __init__(self, template: Any, alone: list[Found], together: Found | None = None) -> None:
+        self.template, self.alone, self.together = template, iter(alone), together
+        self.bundle: Any = SimpleNamespace(calibration=SimpleNamespace(threshold=lambda _: THRESHOLD))
+        self.predicted: list[int] = []
+
+    def decides(self, query: Query) -> bool:
+        return query.refine
+
+    def register(self, frames: tuple[Frame, ...], timer: StageTimer, predicted: tuple[Any, ...] = ()) -> Found:  # noqa: ARG002
+        if len(frames) > 1:
+            assert self.together is not None
+            return self.together
+        self.predicted.append(len(predicted))
+        return next(self.alone)
+
+    def compose(self, frames: tuple[Frame, ...], what: Found, timer: StageTimer) -> Any:  # noqa: ARG002
+        assert what.refined is not None
+        assert what.decision is not None
+        return replace(
+            self.template,
+            status=what.decision.status,
+            confidence=what.decision.confidence,
+            T_map_camera_guess=what.refined.best.T_map_camera,
+            covariance=what.refined.covariance,
+            candidates=what.refined.candidates,
+            frames=len(frames),
+        )
+
+
+@pytest.fixture(scope="module")
+def localizer(bundle_path):
+    return Localizer.open(MapBundle.open(bundle_path))
+
+
+@pytest.fixture(scope="module")
+def frame(localizer, pictures):
+    rgb, depth_m, camera = pictures
+    return localizer.look_up(Query(rgb=rgb, depth_m=depth_m, camera=camera))
+
+
+@pytest.fixture
+def drive(localizer, frame, monkeypatch):
+    """Return a function that follows a robot over scripted registrations, and returns x, status, epoch and frames of each answer."""
+    monkeypatch.setattr(tracker, "extrapolated", lambda *_: ())
+    template = localizer.answer((frame,))
+
+    def run(alone: list[Found], together: Found | None = None) -> list[tuple[float, str, int, int]]:
+        scripted, track = Scripted(template, alone, together), Track()
+        answers: list[tuple[float, str, int, int]] = []
+        for number in range(len(alone)):
+            answer, track = follow(scripted, frame, track, AHEAD if number else None, StageTimer())
+            answers.append((float(answer.T_map_camera_guess[0, 3]), answer.status, answer.epoch, answer.frames))
+            assert len(track.frames) <= MOST_FRAMES - 1
+        return answers
+
+    return run
+
+
+def test_a_sure_frame_needs_no_other(drive):
+    sure = [found(0.97, (float(k), 0.99)) for k in range(3)]
+    assert drive(sure) == [(0.0, "LOCALIZED", 0, 1), (1.0, "LOCALIZED", 0, 1), (2.0, "LOCALIZED", 0, 1)]
+
+
+def test_frames_that_are_unsure_alone_become_sure_by_agreement(drive):
+    """0.7, then 0.7 x 2 x 0.7 against 0.28 x 0.28 and 0.02 x 0.02: above 0.9."""
+    unsure = [found(0.7, (float(k), 0.99)) for k in range(2)]
+    answers = drive(unsure, together=found(0.6, (1.0, 0.9)))
+    assert [status for _, status, _, _ in answers] == ["AMBIGUOUS", "LOCALIZED"]
+
+
+def test_frames_together_decide_what_one_frame_cannot(drive):
+    alone = [found(0.3, (float(k), 0.9)) for k in range(2)]
+    assert drive(alone, together=found(0.95, (1.0, 0.95)))[-1] == (1.0, "LOCALIZED", 0, 2)
+
+
+def test_look_alikes_stay_ambiguous(drive):
+    alike = [found(0.9, (float(k), 0.5), (50.0 + k, 0.5)) for k in range(6)]
+    answers = drive(alike, together=found(0.9, (0.0, 0.5), (50.0, 0.5)))
+    assert {status for _, status, _, _ in answers} == {"AMBIGUOUS"}
+
+
+def test_a_displaced_robot_is_ambiguous_once_and_then_begins_an_epoch(drive):
+    """The frames before still point to the old place, and all frames together would be LOCALIZED there."""
+    old = [found(0.97, (float(k), 0.99)) for k in range(3)]
+    new = [found(0.97, (100.0 + k, 0.99)) for k in range(3)]
+    answers = drive(old + new, together=found(0.95, (3.0, 0.95)))
+    assert [status for _, status, _, _ in answers] == ["LOCALIZED"] * 3 + ["AMBIGUOUS"] + ["LOCALIZED"] * 2
+    assert [epoch for _, _, epoch, _ in answers] == [0, 0, 0, 0, 1, 1]
+    assert answers[4][0] == 101.0
+
+
+def test_unknown_odometry_begins_an_epoch_if_a_pose_was_given_before(localizer, frame, monkeypatch):
+    monkeypatch.setattr(tracker, "extrapolated", lambda *_: ())
+    template = localizer.answer((frame,))
+    scripted = Scripted(template, [found(0.2, (0.0, 0.9)), found(0.97, (0.0, 0.99)), found(0.97, (0.0, 0.99))])
+    track, epochs = Track(), []
+    for _ in range(3):
+        answer, track = follow(scripted, frame, track, None, StageTimer())
+        epochs.append(answer.epoch)
+    assert epochs == [0, 0, 1]
+
+
+def test_the_modes_are_starts_of_the_next_registration(localizer, frame, monkeypatch):
+    monkeypatch.setattr(tracker, "extrapolated", lambda *_: ())
+    scripted = Scripted(localizer.answer((frame,)), [found(0.6, (0.0, 0.7), (50.0, 0.3)), found(0.97, (1.0, 0.99))])
+    _, track = follow(scripted, frame, Track(), None, StageTimer())
+    follow(scripted, frame, track, AHEAD, StageTimer())
+    assert scripted.predicted == [0, 2]
+
+
+@pytest.mark.parametrize(("rate", "weight"), [(0.01, 0.97), (0.02, 0.97 * 0.99)])
+def test_a_frame_out_of_range_says_nothing_at_the_default_rate(localizer, frame, monkeypatch, rate, weight):
+    """At a higher rate, the frame counts as any other: here it finds another place, and the first mode loses its weight."""
+    template = localizer.answer((frame,))
+    asked = replace(frame, query=replace(frame.query, false_accept_rate=rate))
+    elsewhere = found(0.8, (50.0, 0.9))
+    scripted = Scripted(template, [found(0.97, (0.0, 0.99)), elsewhere], together=elsewhere)
+    monkeypatch.setattr(tracker, "extrapolated", lambda *_: ())
+    _, track = follow(scripted, asked, Track(), None, StageTimer())
+    monkeypatch.setattr(tracker, "extrapolated", lambda *_: (("far", 5.0),))
+    answer, _ = follow(scripted, asked, track, AHEAD, StageTimer())
+    assert answer.belief is not None
+    first = answer.belief.modes[0]
+    if rate == 0.01:
+        assert (first.weight, first.unseen) == (pytest.approx(0.97 * 0.99), 1)
+    else:
+        assert len(answer.belief.modes) == 2
+        assert answer.belief.modes[0].weight < 0.9
+
+
+def test_a_map_without_calibration_registers_the_last_frames_together(localizer, frame):
+    track, counts = Track(), []
+    for number in range(MOST_FRAMES + 1):
+        answer, track = follow(localizer, frame, track, np.eye(4) if number else None, StageTimer())
+        counts.append(answer.frames)
+        assert answer.belief is None
+    assert counts == [1, 2, 3, 4, 5, 5]
+
+
+def test_a_carried_track_continues_as_a_kept_one(localizer, frame, monkeypatch):
+    monkeypatch.setattr(tracker, "extrapolated", lambda *_: ())
+    frames = [found(0.97, (float(k), 0.9), (50.0 + k, 0.1)) for k in range(2)]
+    scripted = Scripted(localizer.answer((frame,)), frames)
+    _, track = follow(scripted, frame, Track(epoch=3), AHEAD, StageTimer())
+    content = packed(track, map_version="tiny@1")
+    carried = unpacked(content, map_version="tiny@1")
+    assert len(content) <= MOST_BYTES
+    assert (carried.epoch, carried.frames, carried.belief.born) == (3, (), 2)
+    assert carried.belief.elsewhere == track.belief.elsewhere
+    assert track.last is not None
+    assert carried.last is not None
+    for one, other in zip((*track.belief.modes, track.last), (*carried.belief.modes, carried.last), strict=True):
+        np.testing.assert_allclose(other.T_map_camera, one.T_map_camera, atol=1e-6)
+        np.testing.assert_allclose(other.covariance, one.covariance, rtol=1e-6, atol=1e-12)
+        assert (other.weight, other.number, other.unseen) == (one.weight, one.number, one.unseen)
+
+
+def test_a_carried_track_of_another_map_version_begins_an_epoch(localizer, frame, monkeypatch):
+    monkeypatch.setattr(tracker, "extrapolated", lambda *_: ())
+    scripted = Scripted(localizer.answer((frame,)), [found(0.97, (0.0, 0.9))])
+    _, track = follow(scripted, frame, Track(), None, StageTimer())
+    other = unpacked(packed(track, map_version="tiny@1"), map_version="tiny@2")
+    assert (other.epoch, other.belief.modes, other.last) == (1, (), None)
