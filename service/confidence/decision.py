@@ -43,9 +43,12 @@ class Decision:
 
 
 def decide(
-    calibration: Calibration, evidence: Float64[NDArray[np.float64], " F"] | None, false_accept_rate: float, *,
+    calibration: Calibration,
+    evidence: Float64[NDArray[np.float64], " F"] | None,
+    false_accept_rate: float,
+    *,
     prior_nats: float = 0.0,
-) -> Decision:  # fmt: skip
+) -> Decision:
     """Compute status and confidence from the confidence features.
 
     In the calibration data every second query comes from outside the map. A caller who sends a prior claims that the robot is in
@@ -122,8 +125,11 @@ class Outcome:
 
 
 def decision_of(
-    calibration: Calibration | None, query: Query, refined: Refined | None, evidence: Float64[NDArray[np.float64], " F"] | None
-) -> Decision | None:  # fmt: skip
+    calibration: Calibration | None,
+    query: Query,
+    refined: Refined | None,
+    evidence: Float64[NDArray[np.float64], " F"] | None,
+) -> Decision | None:
     """Decide about an answer, with the prior and the false-accept rate of its query.
 
     Args:
@@ -145,9 +151,15 @@ def decision_of(
 
 
 def outcome_of(
-    calibration: Calibration | None, query: Query, refined: Refined | None, evidence: Float64[NDArray[np.float64], " F"] | None,
-    decision: Decision | None, *, frames: int, extent: Extent,
-) -> Outcome:  # fmt: skip
+    calibration: Calibration | None,
+    query: Query,
+    refined: Refined | None,
+    evidence: Float64[NDArray[np.float64], " F"] | None,
+    decision: Decision | None,
+    *,
+    frames: int,
+    extent: Extent,
+) -> Outcome:
     """Compute reasons and spread of an answer from its decision.
 
     Args:
