@@ -105,7 +105,8 @@ def test_an_equidistant_lens_sees_its_radius_as_an_angle():
     camera = PinholeCamera(500, 500, 100.0, 100.0, 249.5, 249.5, (0.0,) * 4, "kannala_brandt")
     assert reach_of(camera) == pytest.approx(math.pi)
     pixels = np.array([[249.5 + 100, 249.5], [249.5, 249.5 - 200], [249.5, 249.5], [-0.5, -0.5]])
-    expected = [[math.sin(1), 0, math.cos(1)], [0, -math.sin(2), math.cos(2)], [0, 0, 1], [math.nan] * 3]
+    none = [math.nan] * 3
+    expected = np.array([[math.sin(1), 0, math.cos(1)], [0, -math.sin(2), math.cos(2)], [0, 0, 1], none])
     np.testing.assert_allclose(rays_of(camera, pixels), expected, atol=1e-12)
 
 

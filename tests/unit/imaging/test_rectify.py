@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from numpy.typing import NDArray
 
 from service.errors import RequestError, TooLargeError
 from service.geometry.camera import PinholeCamera
@@ -22,7 +23,9 @@ OVER_180 = PinholeCamera(160, 120, 48.0, 48.0, 79.5, 59.5, (0.0,) * 4, "kannala_
 CAMERAS = {"barrel": BARREL, "pincushion": PINCUSHION, "fisheye": FISHEYE, "over 180 degrees": OVER_180}
 
 
-def images_of(camera, *, seed=0, by=1.0):
+def images_of(
+    camera: PinholeCamera, *, seed: int = 0, by: float = 1.0
+) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
     """Colour and depth images of noise, whose pixels all differ."""
     rng, height, width = np.random.default_rng(seed), round(by * camera.height), round(by * camera.width)
     rgb = rng.integers(1, 256, (height, width, 3), np.uint8)
@@ -146,7 +149,7 @@ def test_a_scene_that_is_distorted_and_rectified_is_the_scene_again():
     """A wall 5 m ahead with vertical stripes 0.5 m wide, seen by both cameras."""
     pinhole = rectification_of(BARREL).camera
 
-    def seen_by(rays):
+    def seen_by(rays: NDArray[np.float64]) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
         z_m = np.where(rays[..., 2] > 0, 5.0, 0).astype(np.float32)
         stripe = np.floor(5.0 * rays[..., 0] / rays[..., 2] / 0.5) % 2
         return np.repeat((50 + 150 * stripe).astype(np.uint8)[..., None], 3, axis=-1), z_m
