@@ -30,7 +30,7 @@ from service.localization.localizer import Localizer
 from service.maps.manifest import FILE as MANIFEST_FILE
 from service.maps.manifest import Manifest, read_manifest
 from service.maps.reader import MapBundle
-from service.retrieval.query import Query, query_of_images
+from service.retrieval.query import Query
 
 LIMITS = ImageLimits(max_bytes=2**20, max_pixels=2**20)
 CAMERA = PinholeCamera(64, 48, 32.0, 32.0, 31.5, 23.5)
@@ -282,7 +282,7 @@ def _pictures_of(bundle: Path) -> Callable[[bytes], None]:
         depth_m = depth_from_values(
             np.resize(raw, (48, 64)), scale_m=1.0, kind="z", camera=asked.camera, baseline_m=None, max_range_m=None
         )
-        query = query_of_images(good.rgb, depth_m, asked.camera)
+        query = Query.of_images(good.rgb, depth_m, asked.camera)
         localizer.localize(replace(query, down_camera=asked.down_camera, camera_height=asked.camera_height))
 
     return take

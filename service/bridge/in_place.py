@@ -12,7 +12,7 @@ from service.geometry.camera import PinholeCamera
 from service.imaging.decode import require_sizes
 from service.imaging.depth_units import depth_from_values
 from service.imaging.level import GivenHeight
-from service.retrieval.query import query_of_images
+from service.retrieval.query import Query
 from service.runtime.engine import Located
 from service.runtime.map_registry import MapRegistry
 from service.runtime.threads import limit_pools
@@ -48,6 +48,6 @@ class InPlace:
         require_camera(camera)
         z_m = depth_from_values(depth_m, scale_m=1.0, kind="z", camera=camera, baseline_m=None, max_range_m=None)
         require_sizes(rgb, z_m, camera)
-        query = replace(query_of_images(rgb, z_m, camera), camera_height=self._camera_height)
+        query = replace(Query.of_images(rgb, z_m, camera), camera_height=self._camera_height)
         answer = self._localizer.localize(query)
         return answer_from(Located(answer, self._localizer.bundle))

@@ -6,6 +6,7 @@ import numpy as np
 from jaxtyping import Bool, Float32, Float64, UInt8
 from numpy.typing import NDArray
 
+from service.errors import RequestError
 from service.geometry.camera import PinholeCamera
 from service.geometry.rigid import Transform
 from service.imaging.decode import (
@@ -60,6 +61,45 @@ class Query:
     baseline_m: float | None = None
     false_accept_rate: float = FALSE_ACCEPT_RATE
     observed: Bool[NDArray[np.bool_], "h w"] | None = None
+
+    def __post_init__(self) -> None:
+        """Refuse images that are not rectified.
+
+        Raises:
+            RequestError: the camera has distortion.
+        """
+        if self.camera.is_distorted:
+            raise RequestError(
+                "camera.distortion: a Query has the images of a pinhole camera, but this camera has distortion; make the query by "
+                "Query.of_images, which rectifies both images",
+                field="camera.distortion",
+            )
+
+    @classmethod
+    def of_images(
+        cls,
+        rgb: UInt8[NDArray[np.uint8], "H W 3"],
+        depth_m: Float32[NDArray[np.float32], "h w"],
+        camera: PinholeCamera,
+        *,
+        baseline_m: float | None = None,
+    ) -> "Query":
+        """Rectify an image pair, and build the query that has the default options.
+
+        Args:
+            rgb: sRGB image with the aspect ratio of the camera.
+            depth_m: z of each pixel of the sent image, metres, 0 where nothing was measured. It has the aspect ratio of the camera.
+            camera: intrinsics and distortion of both images.
+            baseline_m: baseline of the stereo rig that measured the depth; None if no rig is known.
+
+        Raises:
+            RequestError: the distortion is not invertible over the image, or the rectified image would be empty.
+            TooLargeError: a side of a distorted image is too long.
+        """
+        pair = rectified_pair(rgb, depth_m, camera)
+        return cls(
+            rgb=pair.rgb, depth_m=pair.depth_m, camera=pair.camera, observed=pair.observed, baseline_m=baseline_m
+        )
 
     @property
     def focal_baseline_px_m(self) -> float | None:
@@ -125,27 +165,4 @@ def decoded_query(
         limits=limits,
     )
     require_sizes(colour, depth_m, camera, rgb_size=stored_size(rgb))
-    return query_of_images(colour, depth_m, camera, baseline_m=depth_format.baseline_m)
-
-
-def query_of_images(
-    rgb: UInt8[NDArray[np.uint8], "H W 3"],
-    depth_m: Float32[NDArray[np.float32], "h w"],
-    camera: PinholeCamera,
-    *,
-    baseline_m: float | None = None,
-) -> Query:
-    """Rectify a decoded image pair, and build the query that has the default options.
-
-    Args:
-        rgb: sRGB image with the aspect ratio of the camera.
-        depth_m: z of each pixel of the sent image, metres, 0 where nothing was measured. It has the aspect ratio of the camera.
-        camera: intrinsics and distortion of both images.
-        baseline_m: baseline of the stereo rig that measured the depth; None if no rig is known.
-
-    Raises:
-        RequestError: the distortion is not invertible over the image, or the rectified image would be empty.
-        TooLargeError: a side of a distorted image is too long.
-    """
-    pair = rectified_pair(rgb, depth_m, camera)
-    return Query(rgb=pair.rgb, depth_m=pair.depth_m, camera=pair.camera, observed=pair.observed, baseline_m=baseline_m)
+    return Query.of_images(colour, depth_m, camera, baseline_m=depth_format.baseline_m)

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from benchmarks.lenses import LENSES, PLAIN, Answered, Photographer, answered, cost_line, line_of
+from benchmarks.lenses import LENSES, Answered, Photographer, answered, cost_line, line_of
 from model_training.simulation.plan import SimulationPlan
 from service.geometry.camera import PinholeCamera
 from service.geometry.distortion import rays_of
