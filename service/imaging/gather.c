@@ -10,12 +10,14 @@
 
 #include "picture.h"
 
-enum { SAMPLES = 9, BLOCK = 128 };
+/* ARGUMENTS: of streetfix_gather. */
+enum { SAMPLES = 9, BLOCK = 128, ARGUMENTS = 14 };
 
 /* Compared with Python's structures when the library is loaded. */
 const LayoutEntry streetfix_layout[] = {
     PICTURE_LAYOUT,
     LAYOUT_CONSTANT(SAMPLES),
+    LAYOUT_CONSTANT(ARGUMENTS),
     LAYOUT_END,
 };
 

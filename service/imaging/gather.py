@@ -8,6 +8,7 @@ import ctypes
 from ctypes import POINTER, byref, c_double, c_int64, c_void_p
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float32, UInt8
@@ -40,11 +41,12 @@ def finest_rad(grid: ViewGrid) -> float:
 
 @cache
 def _library() -> ctypes.CDLL:
-    library = load(LIBRARY, {"Picture": CPicture}, {"SAMPLES": SUB_RAYS**2})
-    library.streetfix_gather.argtypes = [
+    arguments: list[Any] = [
         c_void_p, c_int64, c_void_p, c_void_p, POINTER(CPicture), c_void_p, c_void_p, POINTER(CPicture), c_double, c_double, c_int64,
         c_void_p, c_void_p, c_void_p,
     ]  # fmt: skip
+    library = load(LIBRARY, {"Picture": CPicture}, {"SAMPLES": SUB_RAYS**2, "ARGUMENTS": len(arguments)})
+    library.streetfix_gather.argtypes = arguments
     library.streetfix_gather.restype = None
     return library
 
