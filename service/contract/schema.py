@@ -14,6 +14,8 @@ from service.option_limits import (
     LEAST_FALSE_ACCEPT_RATE,
     LEAST_HEIGHT_M,
     LEAST_HEIGHT_STD_M,
+    LEAST_SIDE,
+    MOST_ASPECT,
     MOST_HEIGHT_M,
     MOST_HEIGHT_STD_M,
     MOST_NEIGHBOURS,
@@ -25,8 +27,8 @@ from service.retrieval.prior import HEADING_STD_DEG, POSITION_STD_M
 #: Limits of a focal length, in widths or heights of the image: 175 and 0.6 degrees of view. A value outside was given in another unit
 #: than pixels.
 LEAST_FOCAL, MOST_FOCAL = 0.02, 100.0
-#: Limits of the sides of an image, pixels, and of their ratio. The longer side determines the memory.
-LEAST_SIDE, MOST_SIDE, MOST_ASPECT = 2, 32768, 16
+#: Longest side of an image, pixels.
+MOST_SIDE = 32768
 #: Limit of the components of a vector whose length does not matter. An accelerometer may use m/s2, thousandths of g or its own steps.
 MOST_COMPONENT = 1e6
 

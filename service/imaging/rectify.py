@@ -30,6 +30,7 @@ from numpy.typing import NDArray
 from service.errors import RequestError, TooLargeError
 from service.geometry.camera import PinholeCamera
 from service.geometry.distortion import distorted_pixels, rays_of, reach_of
+from service.option_limits import LEAST_SIDE, MOST_ASPECT
 
 Rgb = UInt8[NDArray[np.uint8], "H W 3"]
 Depth = Float32[NDArray[np.float32], "h w"]
@@ -38,9 +39,7 @@ Observed = Bool[NDArray[np.bool_], "h w"]
 #: Half of the largest field of a rectified image, degrees. The view grid needs 50 degrees aside (90 degrees, and turns of 5) and 21 above
 #: in its corners. The rest serves cameras that are not level, and registration.
 MOST_ASIDE_DEG, MOST_ABOVE_DEG = 60.0, 45.0
-#: Fewest rows and columns of a rectified image.
-LEAST_SIDE = 2
-#: Memory for tables, bytes in each process: those of 11 cameras of 640 x 480, or of one of 1920 x 1080. The table of a larger image is
+#: Memory for tables, bytes in each process: those of 12 cameras of 640 x 480, or of one of 1920 x 1080. The table of a larger image is
 #: computed for each request.
 TABLES_BYTES = 32 * 2**20
 #: Bytes of a table for each pixel.
@@ -164,20 +163,18 @@ def rectification_of(camera: PinholeCamera) -> Rectification:
         camera: intrinsics and distortion.
 
     Raises:
-        RequestError: the distortion is not invertible over the image, or the image shows nothing of the field.
+        RequestError: the distortion is not invertible over the image, or the image shows hardly anything of the field.
     """
     reach = reach_of(camera)
     field = _field_of(camera, reach)
     if field is None:
-        raise _empty(camera)
+        raise _unusable(camera, "empty", "nothing")
     left, top, right, bottom = field.ravel().tolist()
     across, down = (right - left) * camera.fx, (bottom - top) * camera.fy
-    if not min(across, down) > 0:
-        raise _empty(camera)
-    scale = min(1.0, math.sqrt(camera.width * camera.height / (across * down)))
+    scale = min(1.0, math.sqrt(camera.width * camera.height / max(across * down, 1.0)))
     fx, fy, width, height = scale * camera.fx, scale * camera.fy, round(scale * across), round(scale * down)
-    if min(width, height) < LEAST_SIDE:
-        raise _empty(camera)
+    if min(width, height) < LEAST_SIDE or max(width, height) > MOST_ASPECT * min(width, height):
+        raise _unusable(camera, f"a strip of {width}x{height} pixels", "hardly anything")
     pinhole = PinholeCamera(width, height, fx, fy, -left * fx - 0.5, -top * fy - 0.5)
     return Rectification(camera, pinhole, reach)
 
@@ -316,9 +313,9 @@ def _border(
     return np.concatenate(sides)
 
 
-def _empty(camera: PinholeCamera) -> RequestError:
+def _unusable(camera: PinholeCamera, what: str, shown: str) -> RequestError:
     return RequestError(
-        f"camera: the rectified image would be empty, because the image ({camera.width}x{camera.height}) shows nothing within "
+        f"camera: the rectified image would be {what}, because the image ({camera.width}x{camera.height}) shows {shown} within "
         f"{MOST_ASIDE_DEG:g} degrees beside and {MOST_ABOVE_DEG:g} degrees above and below the optical axis; check cx, cy, fx, fy and "
         "distortion, and send the intrinsics of the whole image or of the crop that you send",
         field="camera",

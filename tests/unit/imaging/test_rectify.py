@@ -242,6 +242,16 @@ def test_an_image_beside_the_axis_shows_nothing_that_a_pinhole_can_show():
     assert told.value.field == "camera"
 
 
+def test_an_image_that_shows_a_sliver_of_the_field_is_refused():
+    """The left border is 50 px or 59.7 degrees from the axis, so the image shows a tip of the field."""
+    camera = PinholeCamera(160, 120, 48.0, 48.0, -50.5, 60.0, (0.0,) * 4, "kannala_brandt")
+    with pytest.raises(
+        RequestError, match=r"^camera: the rectified image would be a strip of 1x22 pixels, .* hardly anything"
+    ) as told:
+        rectification_of(camera)
+    assert told.value.field == "camera"
+
+
 def test_a_side_that_opencv_cannot_remap_is_refused():
     camera = PinholeCamera(32768, 2048, 20000.0, 20000.0, 16384.0, 1024.0, (0.01, 0.0, 0.0, 0.0))
     depth_m = np.ones((4, 64), np.float32)
@@ -281,6 +291,7 @@ def test_a_rectified_camera_is_finite_and_no_larger_than_the_sent_one(
         return
     assert all(map(math.isfinite, (found.fx, found.fy, found.cx, found.cy)))
     assert min(found.width, found.height) >= 2
+    assert max(found.width, found.height) <= 16 * min(found.width, found.height)
     assert found.width * found.height <= width * height + found.width + found.height
     aside = [abs(u - found.cx) / found.fx for u in (-0.5, found.width - 0.5)]
     above = [abs(v - found.cy) / found.fy for v in (-0.5, found.height - 0.5)]
