@@ -49,7 +49,10 @@ def code_hash(*names: str) -> str:
     return digest.hexdigest()[:8]
 
 
-SIMULATION = ("model_training/simulation", "service/geometry/camera.py", "service/geometry/rigid.py")
+SIMULATION = (
+    "model_training/simulation",
+    *(f"service/geometry/{name}.py" for name in ("camera", "distortion", "rigid")),
+)
 ANSWERING = (
     *("service/imaging", "service/geometry", "service/maps", "service/registration"),
     *("service/retrieval", "service/scoring", "service/confidence", "service/localization"),

@@ -8,6 +8,8 @@ FALSE_ACCEPT_RATE = 0.01
 SAFE_CONFIDENCE = 0.9
 #: Lower limit of the option ``false_accept_rate``. No calibration could measure a lower rate.
 LEAST_FALSE_ACCEPT_RATE = 1e-6
+#: Shortest side of an image, pixels, and largest ratio of its sides. The longer side determines the memory of an answer.
+LEAST_SIDE, MOST_ASPECT = 2, 16
 #: Limits of a camera's height above the ground, metres.
 LEAST_HEIGHT_M, MOST_HEIGHT_M = 0.05, 30.0
 #: Limits of the standard deviation of a given height, and its default, metres.

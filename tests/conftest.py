@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from model_training.mapping.voxel_map import VoxelMap
 from service.geometry.camera import PinholeCamera
+from service.geometry.distortion import rays_of
 from service.geometry.rigid import R_BODY_OPTICAL, rotation_z, transform_from, transform_points
 from service.imaging.query_view import query_view
 from service.imaging.view_grid import ViewGrid
@@ -88,6 +89,21 @@ def make_pictures(*, seed: int = 3) -> tuple[NDArray[np.uint8], NDArray[np.float
     depth_m = np.minimum(walls, 1.5 / down).astype(np.float32)
     rgb = rng.integers(0, 256, (48, 64, 3)).astype(np.uint8)
     return rgb, depth_m, camera
+
+
+def make_pictures_through(camera: PinholeCamera, *, seed: int = 3) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
+    """The scene of ``make_pictures`` through any lens, ray by ray. What that camera does not see is black and unmeasured."""
+    rgb, _, plain = make_pictures(seed=seed)
+    walls = np.random.default_rng(seed).uniform(4, 15, 16)
+    pixels = np.stack(np.meshgrid(np.arange(camera.width), np.arange(camera.height)), axis=-1)
+    rays = rays_of(camera, pixels.astype(np.float64)) if camera.is_distorted else camera.rays_of_pixels()
+    front = np.isfinite(rays).all(axis=-1) & (rays[..., 2] > 1e-3)
+    x, y = (np.where(front, rays[..., axis] / np.where(front, rays[..., 2], 1), 9) for axis in (0, 1))
+    u, v = np.rint(plain.fx * x + plain.cx).astype(int), np.rint(plain.fy * y + plain.cy).astype(int)
+    seen = front & (u >= 0) & (u < plain.width) & (v >= 0) & (v < plain.height)
+    z = np.minimum(walls[np.clip(u // 4, 0, 15)], 1.5 / np.maximum(y, 1e-6))
+    colour = rgb[np.clip(v, 0, plain.height - 1), np.clip(u, 0, plain.width - 1)]
+    return np.where(seen[..., None], colour, np.uint8(0)), np.where(seen, z, 0).astype(np.float32)
 
 
 def make_cloud() -> SurfelMap:
@@ -219,6 +235,17 @@ def encoder_of() -> Callable[..., bytes]:
 @pytest.fixture(scope="session")
 def pictures_of() -> Callable[..., tuple[NDArray[np.uint8], NDArray[np.float32], PinholeCamera]]:
     return make_pictures
+
+
+@pytest.fixture(scope="session")
+def pictures_through() -> Callable[..., tuple[NDArray[np.uint8], NDArray[np.float32]]]:
+    return make_pictures_through
+
+
+@pytest.fixture(scope="session")
+def png_and_npy() -> Callable[[NDArray[np.uint8], NDArray[Any]], dict[str, bytes]]:
+    """Encodes a pair without loss."""
+    return lambda rgb, depth_m: {"rgb": jpeg_of(rgb), "depth": npy_of(depth_m)}
 
 
 @pytest.fixture(scope="session")

@@ -7,7 +7,7 @@ import shutil
 import struct
 import zlib
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import cv2
@@ -36,7 +36,8 @@ LIMITS = ImageLimits(max_bytes=2**20, max_pixels=2**20)
 CAMERA = PinholeCamera(64, 48, 32.0, 32.0, 31.5, 23.5)
 _DOCUMENT = {
     "camera": {
-        "width": 64, "height": 48, "fx": 32, "fy": 32, "cx": 31.5, "cy": 23.5, "distortion": [0, 0], "height_m": 0.3, "height_std_m": 0.02,
+        "width": 64, "height": 48, "fx": 32, "fy": 32, "cx": 31.5, "cy": 23.5, "height_m": 0.3, "height_std_m": 0.02,
+        "distortion": [-0.1, 0.02, 0.001, 0], "distortion_model": "brown_conrady",
     },
     "depth": {"scale_m": 0.001, "kind": "disparity", "encoding": "auto", "baseline_m": 0.12, "max_range_m": 40},
     "gravity": {"x": 0, "y": 9.8, "z": 0.1}, "map": "tiny@1", "options": {"neighbours": 5, "refine": True, "false_accept_rate": 0.01},
@@ -95,7 +96,14 @@ def targets(bundle: Path, scratch: Path) -> dict[str, Target]:
         "bundle": Target(_bundle_of(bundle, scratch), (b"\x00\x00\x00\x00", b"\x05\x00\x00\x00"), 0.005),
         "pictures": Target(
             _pictures_of(bundle),
-            (struct.pack("<8d", 32, 32, 31.5, 23.5, 9.8, 0.1, 1.5, 0.1) + _tiny_query().depth_m.tobytes(),),
+            (
+                struct.pack("<13d", 32, 32, 31.5, 23.5, 9.8, 0.1, 1.5, 0.1, 0, 0, 0, 0, 0)
+                + _tiny_query().depth_m.tobytes(),
+                struct.pack("<13d", 32, 32, 31.5, 23.5, 9.8, 0.1, 0, 0.1, 1, -0.1, 0.02, 0.001, 0)
+                + _tiny_query().depth_m.tobytes(),
+                struct.pack("<13d", 32, 32, 31.5, 23.5, 9.8, 0.1, 0, 0.1, -1, 0.01, 0, 0, 0)
+                + _tiny_query().depth_m.tobytes(),
+            ),
             0.015,
         ),
     }
@@ -249,17 +257,20 @@ def _agree(own: Path, name: Path, content: bytes) -> None:
 
 
 def _pictures_of(bundle: Path) -> Callable[[bytes], None]:
-    """Localize with arbitrary intrinsics, gravity, camera height and depth that pass validation."""
+    """Localize with arbitrary intrinsics, lens, gravity, camera height and depth that pass validation."""
     localizer = Localizer.open(MapBundle.open(bundle))
     good = _tiny_query()
 
     def take(data: bytes) -> None:
-        if len(data) < 72:
+        if len(data) < 112:
             return
-        fx, fy, cx, cy, down, aside, height_m, height_std_m = struct.unpack("<8d", data[:64])
+        fx, fy, cx, cy, down, aside, height_m, height_std_m, lens, *distortion = struct.unpack("<13d", data[:104])
         height = {"height_m": height_m, "height_std_m": height_std_m} if height_m > 0 else {}  # else it is found
+        model = {"distortion": distortion, "distortion_model": "brown_conrady" if lens > 0 else "kannala_brandt"}
         document = {
-            "camera": {"width": 64, "height": 48, "fx": fx, "fy": fy, "cx": cx, "cy": cy} | height,
+            "camera": {"width": 64, "height": 48, "fx": fx, "fy": fy, "cx": cx, "cy": cy}
+            | height
+            | (model if lens else {}),
             "gravity": {"x": aside, "y": down, "z": 0.0},
         }
         try:
@@ -267,19 +278,12 @@ def _pictures_of(bundle: Path) -> Callable[[bytes], None]:
         except ValidationError:
             return
         asked = query_from(request, rgb=b"", depth=b"")
-        raw = np.frombuffer(data[64 : 64 + (len(data) - 64) // 4 * 4], np.float32)
+        raw = np.frombuffer(data[104 : 104 + (len(data) - 104) // 4 * 4], np.float32)
         depth_m = depth_from_values(
             np.resize(raw, (48, 64)), scale_m=1.0, kind="z", camera=asked.camera, baseline_m=None, max_range_m=None
         )
-        localizer.localize(
-            Query(
-                rgb=good.rgb,
-                depth_m=depth_m,
-                camera=asked.camera,
-                down_camera=asked.down_camera,
-                camera_height=asked.camera_height,
-            )
-        )
+        query = Query.of_images(good.rgb, depth_m, asked.camera)
+        localizer.localize(replace(query, down_camera=asked.down_camera, camera_height=asked.camera_height))
 
     return take
 

@@ -174,7 +174,8 @@ def _gather(rng: np.random.Generator, height: int, width: int) -> list[NDArray[A
     scale = int(rng.integers(1, 4))
     depth = depth_of(rng, height * scale, width * scale) if rng.random() < 0.3 else depth_of(rng, height, width)
     R = rotation_of(rng) if rng.random() < 0.5 else R_BODY_OPTICAL.T @ rotation_z(rng.uniform(-0.5, 0.5))
-    return list(gather(rgb, depth, camera_of(rng, height, width), R, ViewGrid()))
+    observed = rng.random(depth.shape) < 0.8 if rng.random() < 0.3 else None
+    return list(gather(rgb, depth, camera_of(rng, height, width), R, ViewGrid(), observed))
 
 
 def _level(rng: np.random.Generator, height: int, width: int) -> list[NDArray[Any]]:

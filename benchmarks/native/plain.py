@@ -58,7 +58,12 @@ def fit_ground(
 
 
 def gathered(
-    rgb: NDArray[np.uint8], depth_m: NDArray[np.float32], camera: PinholeCamera, R: Rotation, grid: ViewGrid
+    rgb: NDArray[np.uint8],
+    depth_m: NDArray[np.float32],
+    camera: PinholeCamera,
+    R: Rotation,
+    grid: ViewGrid,
+    observed: NDArray[np.bool_] | None = None,
 ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.bool_]]:
     """Resample both images to a view grid as ``gather.gather`` does.
 
@@ -68,6 +73,7 @@ def gathered(
         camera: intrinsics.
         R: rotation from the level frame of the view to the optical frame.
         grid: view grid.
+        observed: pixels of the depth image that the sensor could see (h, w); None: all.
 
     Returns:
         Range (rows, columns), colour (rows, columns, 3), and whether a ray of the cell hits the depth image.
@@ -82,6 +88,8 @@ def gathered(
         return np.where(inside, v, 0).astype(np.intp), np.where(inside, u, 0).astype(np.intp), inside
 
     row, column, seen = pixels(*depth_m.shape)
+    unseen = np.zeros_like(seen) if observed is None else seen & ~observed[row, column]
+    seen &= ~unseen
     with np.errstate(divide="ignore", invalid="ignore"):
         ranges = depth_m[row, column] / z
     valid = seen & (ranges >= grid.min_range_m) & (ranges <= grid.max_range_m)
@@ -89,6 +97,7 @@ def gathered(
     ranked = np.sort(np.where(valid, ranges, np.inf), axis=0)
     median = np.take_along_axis(ranked, np.maximum(count - 1, 0)[None] // 2, axis=0)[0]
     row, column, hit = pixels(*rgb.shape[:2])
+    hit &= ~unseen
     colour = (rgb[row, column] * hit[..., None]).sum(axis=0) / np.maximum(hit.sum(axis=0), 1)[:, None]
     shape = (grid.rows, grid.columns)
     found = np.where(count >= FEWEST_SAMPLES, median, 0).astype(np.float32).reshape(shape)

@@ -71,7 +71,11 @@ def command(
         typer.Option(help="JSON file with T_vehicle_lidar and T_vehicle_camera, if the recording lacks them."),
     ] = None,
     camera: Annotated[
-        Path | None, typer.Option(help="JSON file with width, height, fx, fy, cx and cy, if the recording lacks them.")
+        Path | None,
+        typer.Option(
+            help="JSON file with width, height, fx, fy, cx and cy, if the recording lacks them. distortion and "
+            "distortion_model describe a lens, as in a request.",
+        ),
     ] = None,
     align: Annotated[
         bool | None,

@@ -7,7 +7,8 @@ from pathlib import Path
 import numpy as np
 
 from service.errors import DatasetError
-from service.geometry.camera import PinholeCamera
+from service.geometry.camera import DistortionModel, PinholeCamera
+from service.geometry.distortion import COEFFICIENTS, coefficient_problem
 from service.geometry.rigid import Transform
 
 _KEYS = ("T_vehicle_lidar", "T_vehicle_camera")
@@ -45,19 +46,21 @@ def read_extrinsics(path: Path) -> Extrinsics:
 
 
 def read_camera(path: Path) -> PinholeCamera:
-    """Read intrinsics: ``{"width", "height", "fx", "fy", "cx", "cy", "distortion": []}``, or the ``camera`` of a request.
+    """Read intrinsics and lens as in the ``camera`` of a request, alone or in the request.
 
     Args:
-        path: of the JSON file; all values in pixels.
+        path: of the JSON file with ``width``, ``height``, ``fx``, ``fy``, ``cx``, ``cy`` (pixels), and for a lens ``distortion`` and
+            ``distortion_model``.
 
     Raises:
-        DatasetError: the file is missing, or a number in it is missing or invalid.
+        DatasetError: the file is missing, or a value in it is missing or invalid.
     """
     try:
         loaded = json.loads(path.read_text())
         told = loaded.get("camera", loaded)
         numbers = {key: float(told[key]) for key in ("width", "height", "fx", "fy", "cx", "cy")}
         distortion = tuple(float(x) for x in told.get("distortion", ()))
+        model: DistortionModel = told.get("distortion_model", "brown_conrady")
     except (
         OSError,
         UnicodeDecodeError,
@@ -70,6 +73,13 @@ def read_camera(path: Path) -> PinholeCamera:
         raise DatasetError(f"{path}: not a valid camera: {type(error).__name__}: {error}", field="camera") from error
     if not all(np.isfinite(x) and x > 0 for key, x in numbers.items() if key not in ("cx", "cy")):
         raise DatasetError(f"{path}: width, height, fx and fy must be more than 0", field="camera")
+    if model not in COEFFICIENTS:
+        raise DatasetError(
+            f"{path}: distortion_model: {model!r} is not valid; choose one of: {', '.join(COEFFICIENTS)}",
+            field="camera",
+        )
+    if problem := coefficient_problem(model, distortion):
+        raise DatasetError(f"{path}: distortion: {problem}", field="camera")
     return PinholeCamera(
         int(numbers["width"]),
         int(numbers["height"]),
@@ -78,6 +88,7 @@ def read_camera(path: Path) -> PinholeCamera:
         numbers["cx"],
         numbers["cy"],
         distortion,
+        model,
     )
 
 

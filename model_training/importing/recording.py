@@ -7,7 +7,7 @@ It also yields unusable frames, as ``Unusable``. So good frames are kept and the
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal, Protocol
+from typing import Any, Protocol
 
 import numpy as np
 from jaxtyping import Float32, Float64, UInt8, UInt16
@@ -21,7 +21,6 @@ from service.geometry.rigid import Transform
 #: Greatest time between colour and depth of a pair, seconds. One camera gives both nearly the same stamp. TUM's sequences have
 #: separate stamps.
 PAIR_TOLERANCE_S = 0.02
-Lens = Literal["pinhole", "fisheye"]
 Depth = UInt16[NDArray[np.uint16], "H W"] | Float32[NDArray[np.float32], "H W"]
 
 
@@ -56,7 +55,6 @@ class RecordedPicture:
             recording has none.
         depth_scale_m: metres per step of an integer depth.
         file: file of ``rgb``. It is copied unchanged if no rectification is needed.
-        lens: model of ``camera.distortion``: OpenCV's pinhole models, or its fisheye model.
         baseline_m: baseline of the stereo rig that the depth was matched from, metres; None for other depth.
     """
 
@@ -68,7 +66,6 @@ class RecordedPicture:
     depth: Depth | None = None
     depth_scale_m: float = 0.001
     file: Path | None = None
-    lens: Lens = "pinhole"
     baseline_m: float | None = None
 
 

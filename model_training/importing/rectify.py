@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import UInt8
 from numpy.typing import NDArray
 
-from model_training.importing.recording import Depth, Lens, RecordedPicture
+from model_training.importing.recording import Depth, RecordedPicture
 from service.geometry.camera import PinholeCamera
 
 
@@ -32,18 +32,23 @@ def rectified(picture: RecordedPicture) -> RecordedPicture:
         The image pair without distortion; the same object if it has none.
     """
     camera = picture.camera
-    if not any(camera.distortion):
+    if not camera.is_distorted:
         return picture
-    maps = _maps(camera, picture.lens)
+    maps = _maps(camera)
     depth = None if picture.depth is None else _nearest(picture.depth, maps)
     return replace(
-        picture, rgb=_smooth(picture.rgb, maps), depth=depth, camera=replace(camera, distortion=()), file=None
+        picture,
+        rgb=_smooth(picture.rgb, maps),
+        depth=depth,
+        camera=replace(camera, distortion=(), distortion_model="brown_conrady"),
+        file=None,
     )
 
 
 @lru_cache(maxsize=8)
-def _maps(camera: PinholeCamera, lens: Lens) -> _Maps:
-    rectify = cv2.fisheye.initUndistortRectifyMap if lens == "fisheye" else cv2.initUndistortRectifyMap
+def _maps(camera: PinholeCamera) -> _Maps:
+    is_fisheye = camera.distortion_model == "kannala_brandt"
+    rectify = cv2.fisheye.initUndistortRectifyMap if is_fisheye else cv2.initUndistortRectifyMap
     u, v = rectify(
         camera.matrix,
         np.array(camera.distortion),

@@ -123,6 +123,4 @@ class RosBag:
         if rgb.shape[:2] != size or (depth is not None and depth.shape != size):
             have = f"colour {rgb.shape[:2]}" + ("" if depth is None else f", depth {depth.shape}")
             return Unusable("image", name, f"sizes differ: {have}, camera {size}; record depth aligned to colour")
-        return RecordedPicture(
-            name, pair.stamp_s, rgb, camera.pinhole, camera.T_vehicle_camera, depth=depth, lens=camera.lens
-        )
+        return RecordedPicture(name, pair.stamp_s, rgb, camera.pinhole, camera.T_vehicle_camera, depth=depth)

@@ -7,12 +7,12 @@ from typing import Any
 import numpy as np
 
 from model_training.importing.extrinsics import Extrinsics
-from model_training.importing.recording import Lens
 from model_training.importing.ros_frames import FrameTree, stamp_of, transform_of
-from model_training.importing.ros_picture import camera_of, is_rectified_by_name
+from model_training.importing.ros_picture import camera_of
 from model_training.importing.ros_reader import BagReader, Damage
 from model_training.importing.ros_topics import POSE_TYPES, Topics, topics_of
 from model_training.importing.trajectory import Trajectory
+from service.bridge.pictures import is_rectified_by_name
 from service.errors import DatasetError
 from service.geometry.camera import PinholeCamera
 from service.geometry.rigid import Transform
@@ -49,12 +49,10 @@ class BagCamera:
 
     Attributes:
         pinhole: intrinsics and distortion.
-        lens: model of the distortion.
         T_vehicle_camera: mounting of the optical frame (4, 4).
     """
 
     pinhole: PinholeCamera
-    lens: Lens
     T_vehicle_camera: Transform
 
 
@@ -186,7 +184,6 @@ def _camera(
             "camera with --camera FILE, give its topic with --topic info=..., or pass --no-pictures",
             field="info",
         )
-    lens: Lens = "pinhole"
     if settings.camera is not None:
         pinhole, frame = settings.camera, bag.first(topics.color.name).header.frame_id
     else:
@@ -198,13 +195,13 @@ def _camera(
             raise DatasetError(
                 f"{bag.name}, topic {topics.info.name}: {found}; give the camera with --camera FILE", field="info"
             )
-        (pinhole, lens), frame = found, message.header.frame_id
+        pinhole, frame = found, message.header.frame_id
     T = settings.extrinsics.T_vehicle_camera
     if T is None and vehicle and (known := tree.fixed(vehicle, frame)) is not None:
         T = known
     if T is None:  # use the LiDAR as an intermediate frame: --extrinsics may give its mounting
         T = T_vehicle_lidar @ _mounting(bag.name, tree, scan_frame, frame, "T_vehicle_camera")
-    return BagCamera(pinhole, lens, T)
+    return BagCamera(pinhole, T)
 
 
 def _mounting(name: str, tree: FrameTree, target: str, source: str, key: str) -> Transform:

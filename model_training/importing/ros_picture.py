@@ -1,14 +1,17 @@
 """Read ``sensor_msgs/Image``, ``CompressedImage`` and ``CameraInfo``."""
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 from jaxtyping import UInt8
 from numpy.typing import NDArray
 
-from model_training.importing.recording import Depth, Lens
+from model_training.importing.recording import Depth
+from service.bridge.pictures import LENSES
 from service.errors import StreetfixError
 from service.geometry.camera import PinholeCamera
+from service.geometry.distortion import COEFFICIENTS
 from service.imaging.decode import ImageLimits, decode_rgb
 from service.imaging.ros_depth import read_ros_depth
 
@@ -23,12 +26,6 @@ _COLOUR = {
     "8UC3": (3, (2, 1, 0)),
 }
 _DEPTH = {"16UC1": "u2", "mono16": "u2", "32FC1": "f4"}
-_PINHOLE_MODELS = ("", "plumb_bob", "rational_polynomial")
-_FISHEYE_MODELS = ("equidistant", "fisheye", "kannala_brandt4")
-#: Numbers of distortion coefficients that OpenCV accepts, by lens.
-_COEFFICIENTS: dict[Lens, tuple[int, ...]] = {"pinhole": (4, 5, 8, 12, 14), "fisheye": (4,)}
-#: Suffixes that image_transport adds to the name of an image topic.
-_TRANSPORTS = ("compressed", "compressedDepth")
 _LIMITS = ImageLimits()
 
 
@@ -75,21 +72,11 @@ def depth_of(message: Any) -> Depth | str:
     return _as_depth(np.ascontiguousarray(pixels[:, :, 0]))
 
 
-def is_rectified_by_name(topic: str) -> bool:
-    """Check whether a topic's name says that its images are rectified (``image_rect_color``, ``image_rect/compressed``).
-
-    Args:
-        topic: name of the topic.
-    """
-    parts = [part for part in topic.split("/") if part not in _TRANSPORTS]
-    return "rect" in parts[-1] if parts else False
-
-
 def _as_depth(values: NDArray[Any]) -> Depth:
     return np.asarray(values, np.uint16) if values.dtype == np.uint16 else np.asarray(values, np.float32)
 
 
-def camera_of(message: Any, *, is_rectified: bool) -> tuple[PinholeCamera, Lens] | str:
+def camera_of(message: Any, *, is_rectified: bool) -> PinholeCamera | str:
     """Read the intrinsics of a CameraInfo and the distortion to remove, or say why there are none.
 
     Args:
@@ -102,14 +89,9 @@ def camera_of(message: Any, *, is_rectified: bool) -> tuple[PinholeCamera, Lens]
     matrix = P[:, :3] if is_rectified and P[0, 0] > 0 else K
     if not (matrix[0, 0] > 0 and matrix[1, 1] > 0 and np.isfinite(matrix).all()):
         return "its focal lengths are not positive: the camera is not calibrated"
-    model = message.distortion_model
-    if model not in (*_PINHOLE_MODELS, *_FISHEYE_MODELS) and D.any() and not is_rectified:
-        return f"unknown distortion_model {model[:40]!r} (known: {', '.join((*_PINHOLE_MODELS[1:], *_FISHEYE_MODELS))})"
-    distortion = () if is_rectified or not D.any() else tuple(float(x) for x in D)
-    lens: Lens = "fisheye" if model in _FISHEYE_MODELS else "pinhole"
-    if distortion and (len(distortion) not in _COEFFICIENTS[lens] or not np.isfinite(distortion).all()):
-        wanted = " or ".join(str(n) for n in _COEFFICIENTS[lens])
-        return f"distortion_model {model!r} has {len(distortion)} coefficients; expected {wanted} finite ones"
+    model, lens = message.distortion_model, LENSES.get(message.distortion_model)
+    if lens is None and D.any() and not is_rectified:
+        return f"unknown distortion_model {model[:40]!r} (known: {', '.join(filter(None, LENSES))})"
     camera = PinholeCamera(
         int(message.width),
         int(message.height),
@@ -117,9 +99,13 @@ def camera_of(message: Any, *, is_rectified: bool) -> tuple[PinholeCamera, Lens]
         float(matrix[1, 1]),
         float(matrix[0, 2]),
         float(matrix[1, 2]),
-        distortion,
     )
-    return camera, lens
+    if is_rectified or lens is None or not (D.any() or (lens == "kannala_brandt" and D.size)):
+        return camera
+    if D.size not in COEFFICIENTS[lens] or not np.isfinite(D).all():
+        wanted = " or ".join(str(n) for n in COEFFICIENTS[lens])
+        return f"distortion_model {model!r} has {D.size} coefficients; expected {wanted} finite ones"
+    return replace(camera, distortion=tuple(D.tolist()), distortion_model=lens)
 
 
 def _pixels(message: Any, dtype: str, channels: int) -> NDArray[Any] | str:

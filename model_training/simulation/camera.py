@@ -14,6 +14,7 @@ from model_training.simulation.scene import Hits, Scene
 from model_training.simulation.shading import Light, shade, shadows
 from model_training.simulation.terrain import GroundPicture
 from service.geometry.camera import PinholeCamera
+from service.geometry.distortion import rays_of
 
 #: Pixels between shadow rays, horizontally and vertically: a quarter of the rays.
 SHADOW_STEP = 2
@@ -37,9 +38,19 @@ class Picture:
 def unit_rays(camera: PinholeCamera) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Return the unit rays (N, 3) of all N = H * W pixels in the optical frame, row by row, and their z components (N,).
 
+    A pixel whose ray has no z, or that the lens does not see, has a z component of 0, so its depth is 0.
+
     Args:
-        camera: intrinsics.
+        camera: intrinsics and distortion.
+
+    Raises:
+        RequestError: the distortion is not invertible over the image.
     """
+    if camera.is_distorted:
+        pixels = np.stack(np.meshgrid(np.arange(camera.width), np.arange(camera.height)), axis=-1)
+        bent = np.nan_to_num(rays_of(camera, pixels.reshape(-1, 2).astype(np.float64)))
+        bent[~bent.any(axis=1), 2] = -1.0
+        return bent.astype(np.float32), np.maximum(bent[:, 2], 0).astype(np.float32)
     rays = camera.rays_of_pixels().reshape(-1, 3)
     length = np.linalg.norm(rays, axis=1)
     return (rays / length[:, None]).astype(np.float32), (1.0 / length).astype(np.float32)

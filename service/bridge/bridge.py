@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from service.bridge.diagnostics import Counts, Diagnosis, Level, of_answer
 from service.bridge.gate import Gate
 from service.bridge.pairs import Pair, Pairs, nanoseconds_of
-from service.bridge.pictures import camera_from, depth_from, rgb_from
+from service.bridge.pictures import camera_from, depth_from, is_rectified_by_name, rgb_from
 from service.bridge.pose import CAMERA_AS_BODY, StampedPose, pose_of
 from service.contract.schema import LocalizeAnswer
 from service.errors import StreetfixError
@@ -70,7 +70,7 @@ class Bridge:
         pairs: received messages.
         T_vehicle_camera: from the camera frame to the vehicle frame, metres.
         frame_id: of the map.
-        rectified: see ``camera_from``.
+        rectified: see ``camera_from``. The name of the colour topic can say the same.
         clock: monotonic time, s.
         counts: since the start.
     """
@@ -120,7 +120,8 @@ class Bridge:
         self._recent_s.append(began)
         self.counts.queries += 1
         try:
-            camera = camera_from(pair.info, self.topics.info, rectified=self.rectified)
+            rectified = self.rectified or is_rectified_by_name(self.topics.color)
+            camera = camera_from(pair.info, self.topics.info, rectified=rectified)
             rgb, depth_m = rgb_from(pair.color, self.topics.color), depth_from(pair.depth, self.topics.depth)
             answer = self.localize(rgb, depth_m, camera)
         except StreetfixError as error:

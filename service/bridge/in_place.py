@@ -1,5 +1,6 @@
 """The pipeline in the process of the bridge, without a service and without encoded images."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -39,13 +40,14 @@ class InPlace:
         Args:
             rgb: sRGB image, (H, W, 3).
             depth_m: z along the optical axis, metres, (H, W).
-            camera: intrinsics of both images.
+            camera: intrinsics and distortion of both images.
 
         Raises:
-            RequestError: the intrinsics are invalid, an image does not fit them, or the depth image holds no depth.
+            RequestError: the intrinsics or the distortion are invalid, an image does not fit them, or the depth image holds no depth.
         """
         require_camera(camera)
         z_m = depth_from_values(depth_m, scale_m=1.0, kind="z", camera=camera, baseline_m=None, max_range_m=None)
         require_sizes(rgb, z_m, camera)
-        answer = self._localizer.localize(Query(rgb=rgb, depth_m=z_m, camera=camera, camera_height=self._camera_height))
+        query = replace(Query.of_images(rgb, z_m, camera), camera_height=self._camera_height)
+        answer = self._localizer.localize(query)
         return answer_from(Located(answer, self._localizer.bundle))

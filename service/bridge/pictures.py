@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.errors import RequestError
-from service.geometry.camera import PinholeCamera
+from service.geometry.camera import DistortionModel, PinholeCamera
 
 #: Number of channels, and the OpenCV conversion to RGB; None if the image is RGB already.
 _COLOURS: dict[str, tuple[int, int | None]] = {
@@ -23,6 +23,17 @@ _COLOURS: dict[str, tuple[int, int | None]] = {
 }
 #: Depth encodings of REP 118: unsigned millimetres or floating-point metres. Some drivers call the former mono16.
 _DEPTHS = {"16UC1": "u2", "mono16": "u2", "32FC1": "f4"}
+#: Our model for each ``distortion_model`` of a CameraInfo (REP 104 and drivers). Both give OpenCV's coefficients.
+LENSES: dict[str, DistortionModel] = {
+    "": "brown_conrady",
+    "plumb_bob": "brown_conrady",
+    "rational_polynomial": "brown_conrady",
+    "equidistant": "kannala_brandt",
+    "fisheye": "kannala_brandt",
+    "kannala_brandt4": "kannala_brandt",
+}
+#: Suffixes that image_transport adds to the name of an image topic.
+_TRANSPORTS = ("compressed", "compressedDepth")
 
 
 class StampLike(Protocol):
@@ -57,6 +68,7 @@ class CameraInfoLike(Protocol):
     header: Any
     height: int
     width: int
+    distortion_model: str
     d: Sequence[float]
     k: Sequence[float]
     p: Sequence[float]
@@ -101,8 +113,21 @@ def depth_from(message: ImageLike, topic: str) -> NDArray[np.float32]:
     return values if known == "f4" else values * np.float32(0.001)
 
 
+def is_rectified_by_name(topic: str) -> bool:
+    """Check whether a topic's name says that its images are rectified (``image_rect_color``, ``image_rect/compressed``).
+
+    Args:
+        topic: name of the topic.
+    """
+    parts = [part for part in topic.split("/") if part not in _TRANSPORTS]
+    return "rect" in parts[-1] if parts else False
+
+
 def camera_from(message: CameraInfoLike, topic: str, *, rectified: bool = False) -> PinholeCamera:
-    """Return the rectified camera: from P if it is set, else from K, shifted by the region of interest.
+    """Return the camera of the images, shifted by the region of interest.
+
+    Raw images have K and the lens of the message. Rectified images have P if it is set, else K. The images count as rectified if the
+    lens does not distort.
 
     Args:
         message: calibration of the RGB camera.
@@ -110,16 +135,11 @@ def camera_from(message: CameraInfoLike, topic: str, *, rectified: bool = False)
         rectified: the images are rectified already, although the message has distortion coefficients.
 
     Raises:
-        RequestError: the camera is not calibrated, or the images are not rectified.
+        RequestError: the camera is not calibrated, or the service does not know the model of its lens.
     """
-    if any(message.d) and not rectified:
-        raise RequestError(
-            f"{topic}: the lens distorts (d = {[round(each, 4) for each in message.d]}), but the images must be rectified; subscribe to "
-            "the rectified topics of image_proc and pass --rectified",
-            field=topic,
-        )
+    lens = None if rectified else _lens_of(message, topic)
     p, k = message.p, message.k
-    fx, fy, cx, cy = (p[0], p[5], p[2], p[6]) if p[0] else (k[0], k[4], k[2], k[5])
+    fx, fy, cx, cy = (p[0], p[5], p[2], p[6]) if p[0] and lens is None else (k[0], k[4], k[2], k[5])
     width, height = message.width, message.height
     if not (fx > 0 and fy > 0 and width > 1 and height > 1):
         raise RequestError(
@@ -129,7 +149,23 @@ def camera_from(message: CameraInfoLike, topic: str, *, rectified: bool = False)
     if message.roi.width and message.roi.height:
         width, height = message.roi.width, message.roi.height
         cx, cy = cx - message.roi.x_offset, cy - message.roi.y_offset
-    return PinholeCamera(width, height, fx, fy, cx, cy)
+    if lens is None:
+        return PinholeCamera(width, height, fx, fy, cx, cy)
+    return PinholeCamera(width, height, fx, fy, cx, cy, tuple(float(each) for each in message.d), lens)
+
+
+def _lens_of(message: CameraInfoLike, topic: str) -> DistortionModel | None:
+    """Return the model of the lens; None if the images show no distortion."""
+    lens = LENSES.get(message.distortion_model)
+    if lens is None and any(message.d):
+        raise RequestError(
+            f"{topic}: the distortion_model {message.distortion_model!r} is not known (known: {', '.join(filter(None, LENSES))}); "
+            "subscribe to the rectified topics of image_proc and pass --rectified",
+            field=topic,
+        )
+    if lens == "kannala_brandt" and len(message.d):
+        return lens
+    return lens if any(message.d) else None
 
 
 def _rows(message: ImageLike, topic: str, dtype: np.dtype[Any], channels: int) -> NDArray[Any]:

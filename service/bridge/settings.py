@@ -72,7 +72,11 @@ class BridgeSettings:
         float,
         "Height of the camera above the ground, metres. 0: from --base-on-ground, otherwise from the depth image.",
     ] = 0.0
-    rectified: Annotated[bool, "The images are rectified, whatever lens the CameraInfo describes."] = False
+    rectified: Annotated[
+        bool,
+        "The images are rectified, whatever lens the CameraInfo describes. A colour topic whose name says rect counts as rectified too. "
+        "The service rectifies other images.",
+    ] = False
     rate: Annotated[float, "Largest number of queries per second. 0 sends one for every pair."] = 1.0
     min_confidence: Annotated[float, "Smallest confidence of a published pose. 0 passes every LOCALIZED answer."] = 0.9
     tolerance: Annotated[float, "Largest difference between the stamps of colour and depth, seconds."] = 0.02

@@ -129,7 +129,8 @@ class GrpcClient:
             depth: (H, W), metres along the optical axis as floating-point values, or uint16 (millimetres unless
                 ``depth_scale_m`` is given). 0 and NaN mean that nothing was measured. Or the bytes of a 16-bit PNG, TIFF, NPY
                 or raw16 file.
-            camera: rectified intrinsics, pixels. Either image may be a uniformly resized version of this camera's image.
+            camera: intrinsics of both images, pixels, and their distortion if they are not rectified. Either image may be a
+                uniformly resized version of this camera's image.
             **about: optional data; see ``About``.
         """
         message = grpc_messages.request_message(prepare.one(rgb, depth, camera, about, self._packing))

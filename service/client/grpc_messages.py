@@ -7,6 +7,10 @@ from service.contract import schema
 from service.grpc.generated.streetfix.v1 import localization_pb2 as pb
 
 _KINDS = {"z": pb.DEPTH_KIND_Z, "range": pb.DEPTH_KIND_RANGE, "disparity": pb.DEPTH_KIND_DISPARITY}
+_LENSES = {
+    "brown_conrady": pb.DISTORTION_MODEL_UNSPECIFIED,
+    "kannala_brandt": pb.DISTORTION_MODEL_KANNALA_BRANDT,
+}
 _CALIBRATION = {pb.CALIBRATION_RANGE_IN_RANGE: "in_range", pb.CALIBRATION_RANGE_EXTRAPOLATED: "extrapolated"}
 _STATUS_PREFIX, _SECTION_PREFIX, _ORIGIN_PREFIX = "LOCALIZATION_STATUS_", "STREET_SECTION_", "CAMERA_HEIGHT_ORIGIN_"
 
@@ -170,7 +174,7 @@ def _camera(camera: schema.Camera) -> pb.Camera:
     numbers = {name: getattr(camera, name) for name in ("width", "height", "fx", "fy", "cx", "cy", "distortion")}
     if camera.height_m is not None:
         numbers |= {"height_m": camera.height_m, "height_std_m": camera.height_std_m}
-    return pb.Camera(model=pb.CAMERA_MODEL_PINHOLE, **numbers)
+    return pb.Camera(model=pb.CAMERA_MODEL_PINHOLE, distortion_model=_LENSES[camera.distortion_model], **numbers)
 
 
 def _depth(depth: schema.Depth) -> pb.DepthFormat:

@@ -101,7 +101,7 @@ class Frame:
         rgb: (H, W, 3), sRGB, or the bytes of a JPEG, PNG or WebP file.
         depth: (H, W), metres as floating-point values, or uint16. 0 and NaN mean that nothing was measured. Or the bytes of a
             16-bit PNG, TIFF, NPY or raw16 file.
-        camera: rectified intrinsics, pixels.
+        camera: intrinsics of both images, pixels, and their distortion if they are not rectified.
         T_reference_camera: (4, 4), transform from this camera to the first frame's camera, metres. None in the first frame
             and in a batch.
         gravity, depth_scale_m, depth_kind, max_range_m, baseline_m, camera_height_m, camera_height_std_m: as in ``About``.
@@ -141,7 +141,7 @@ def one(
     Args:
         rgb: (H, W, 3), sRGB, or the bytes of an image file.
         depth: (H, W), metres along the optical axis as floating-point values, or uint16. Or the bytes of an image file.
-        camera: rectified intrinsics, pixels.
+        camera: intrinsics of both images, pixels, and their distortion if they are not rectified.
         about: optional data of the query.
         packing: how images are encoded.
 
@@ -292,7 +292,13 @@ def _camera(camera: Camera) -> dict[str, Any]:
     if isinstance(camera, schema.Camera):
         return camera.model_dump(exclude_unset=True)
     numbers = {name: getattr(camera, name) for name in ("width", "height", "fx", "fy", "cx", "cy")}
-    return numbers | {"distortion": list(camera.distortion)}
+    content = numbers | {"distortion": list(camera.distortion)}
+    # An earlier service does not know the field, so only a fisheye lens sends it.
+    return (
+        content
+        if camera.distortion_model == "brown_conrady"
+        else content | {"distortion_model": camera.distortion_model}
+    )
 
 
 def _height(frame: Frame, where: str) -> dict[str, float]:

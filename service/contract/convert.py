@@ -15,7 +15,7 @@ from service.confidence.reasons import Reason
 from service.confidence.spread import Spread
 from service.contract import schema
 from service.contract.invalid import invalid
-from service.errors import NotYetSupportedError, RequestError, StreetfixError
+from service.errors import RequestError, StreetfixError
 from service.geometry.camera import PinholeCamera
 from service.geometry.rigid import (
     heading_of_body,
@@ -85,9 +85,7 @@ def query_from(request: schema.LocalizeRequest, *, rgb: bytes, depth: bytes) -> 
 
     Raises:
         RequestError: a field contradicts other fields.
-        NotYetSupportedError: this release cannot use a field.
     """
-    _require_supported(request.camera)
     T_vehicle_camera = (
         None if request.T_vehicle_camera is None else transform_of(request.T_vehicle_camera, "T_vehicle_camera")
     )
@@ -96,7 +94,7 @@ def query_from(request: schema.LocalizeRequest, *, rgb: bytes, depth: bytes) -> 
         rgb=rgb,
         depth=depth,
         map_name=request.map,
-        camera=_camera(request.camera),
+        camera=camera_of(request.camera),
         depth_encoding=request.depth.encoding,
         depth_kind=request.depth.kind,
         scale_m=request.depth.scale_m,
@@ -143,7 +141,6 @@ def sequence_from(
 
     Raises:
         RequestError: a field contradicts other fields.
-        NotYetSupportedError: this release cannot use a field.
     """
     queries, transforms = [], []
     T_vehicle_reference = None
@@ -352,30 +349,30 @@ def map_entry_from(bundle: MapBundle, versions: Sequence[Localizer]) -> schema.M
     )
 
 
-def _require_supported(camera: schema.Camera) -> None:
-    if any(camera.distortion):
-        raise NotYetSupportedError(
-            "camera.distortion: only rectified images are supported; rectify both images and send no distortion",
-            field="camera.distortion",
-        )
-
-
 def require_camera(camera: PinholeCamera) -> None:
-    """Check intrinsics that did not come by a request against the limits of the contract.
+    """Check intrinsics and distortion that did not come by a request against the limits of the contract.
 
     Args:
-        camera: the intrinsics.
+        camera: the intrinsics and the distortion.
 
     Raises:
         RequestError: a number is out of its limits.
     """
-    numbers = {name: getattr(camera, name) for name in ("width", "height", "fx", "fy", "cx", "cy")}
+    names = ("width", "height", "fx", "fy", "cx", "cy", "distortion_model")
+    content = {name: getattr(camera, name) for name in names} | {"distortion": list(camera.distortion)}
     with fields_under("camera"):
-        checked(numbers, schema.Camera)
+        checked(content, schema.Camera)
 
 
-def _camera(camera: schema.Camera) -> PinholeCamera:
-    return PinholeCamera(camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy)
+def camera_of(camera: schema.Camera) -> PinholeCamera:
+    """Convert intrinsics and lens. Coefficients that are all zero are no lens of Brown and Conrady.
+
+    Args:
+        camera: of a request.
+    """
+    plain = PinholeCamera(camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy)
+    lens = replace(plain, distortion=tuple(camera.distortion), distortion_model=camera.distortion_model)
+    return lens if lens.is_distorted else plain
 
 
 def _prior(prior: schema.Prior) -> Prior:

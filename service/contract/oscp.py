@@ -2,7 +2,8 @@
 
 Source: github.com/OpenArCloud/oscp-geopose-protocol (README, November 2026). This module settles what the protocol leaves open:
 
-- Intrinsics follow COLMAP: the corner of the first pixel is (0, 0). In our contract, its centre is (0, 0).
+- Intrinsics follow COLMAP: the corner of the first pixel is (0, 0). In our contract, its centre is (0, 0). COLMAP's fisheye models
+  are those of Kannala and Brandt with one, two or four coefficients, its others those of Brown and Conrady.
 - A DEPTH image of integers holds millimetres, one of floats holds metres. Depth beyond the
   maximum of ``minMaxDepth`` counts as not measured.
 - An accuracy of 0, or above ``_MOST_STD_M``, means unknown. The clients' structures start with 0 and with the largest float.
@@ -22,19 +23,26 @@ from pydantic import BaseModel, ConfigDict, Field
 from service.contract import schema
 from service.contract.convert import checked, query_from
 from service.errors import DecodeError, NotYetSupportedError, RequestError
+from service.geometry.camera import DistortionModel
 from service.geometry.rigid import rotation_from_quaternion_xyzw
 from service.option_limits import LEAST_HEIGHT_M, LEAST_HEIGHT_STD_M, MOST_HEIGHT_M, MOST_HEIGHT_STD_M
 from service.runtime.engine import EncodedQuery
 
-#: Number of focal lengths and of distortion coefficients per camera model. The principal point has two numbers in each model.
-_MODELS = {
-    "SIMPLE_PINHOLE": (1, 0),
-    "PINHOLE": (2, 0),
-    "SIMPLE_RADIAL": (1, 1),
-    "RADIAL": (1, 2),
-    "OPENCV": (2, 4),
-    "FULL_OPENCV": (2, 8),
+#: Number of focal lengths and of distortion coefficients per camera model, and our model of the lens. The principal point has two numbers
+#: in each model. All coefficients have OpenCV's order.
+_MODELS: dict[str, tuple[int, int, DistortionModel]] = {
+    "SIMPLE_PINHOLE": (1, 0, "brown_conrady"),
+    "PINHOLE": (2, 0, "brown_conrady"),
+    "SIMPLE_RADIAL": (1, 1, "brown_conrady"),
+    "RADIAL": (1, 2, "brown_conrady"),
+    "OPENCV": (2, 4, "brown_conrady"),
+    "FULL_OPENCV": (2, 8, "brown_conrady"),
+    "SIMPLE_RADIAL_FISHEYE": (1, 1, "kannala_brandt"),
+    "RADIAL_FISHEYE": (1, 2, "kannala_brandt"),
+    "OPENCV_FISHEYE": (2, 4, "kannala_brandt"),
 }
+#: Fewest coefficients of either model in our contract.
+_COEFFICIENTS = 4
 _COLOUR = ("RGBA32", "RGB", "JPG", "GRAY8")
 _MOST_READINGS = 64
 _SAME_VIEW = 0.01  # of the image size
@@ -221,7 +229,7 @@ def query_of(request: GeoPoseRequest, map_name: str | None) -> EncodedQuery:
 
     Raises:
         RequestError: a reading is missing or invalid. A colour image without its DEPTH image is also an error.
-        NotYetSupportedError: an image is distorted, mirrored or rotated.
+        NotYetSupportedError: an image is mirrored or rotated, or the DEPTH image is of another camera.
     """
     readings = request.sensorReadings or SensorReadings()
     where = "sensorReadings.cameraReadings"
@@ -296,7 +304,7 @@ def _camera(reading: CameraReading) -> dict[str, Any]:
             "sensorReadings.cameraReadings.size: width or height is missing; send [width, height]",
             field="sensorReadings.cameraReadings.size",
         )
-    focal = _MODELS[model][0]
+    focal, count, lens = _MODELS[model]
     fx, fy = numbers[0], numbers[focal - 1]
     cx, cy = numbers[focal : focal + 2]
     return {
@@ -306,8 +314,15 @@ def _camera(reading: CameraReading) -> dict[str, Any]:
         "fy": fy,
         "cx": cx - 0.5,
         "cy": cy - 0.5,
-        "distortion": numbers[focal + 2 :],
+        "distortion": numbers[focal + 2 :] + [0.0] * (max(count, _COEFFICIENTS) - count if count else 0),
+        "distortion_model": lens,
     }
+
+
+def _lens(camera: dict[str, Any]) -> tuple[str, tuple[float, ...]] | None:
+    """Return model and coefficients of the lens; None for a pinhole."""
+    model, distortion = camera["distortion_model"], tuple(camera["distortion"])
+    return (model, distortion) if model == "kannala_brandt" or any(distortion) else None
 
 
 def _height(reading: CameraReading) -> dict[str, float]:
@@ -319,10 +334,19 @@ def _height(reading: CameraReading) -> dict[str, float]:
 
 
 def _require_same_view(colour: CameraReading, depth: CameraReading) -> None:
-    """Refuse depth of another camera. The service reads depth with the colour camera's intrinsics, so depth must be aligned with it."""
+    """Refuse depth of another camera or another lens.
+
+    The service reads depth with the colour camera's intrinsics, so depth must be aligned with it.
+    """
     if depth.params is None or not depth.params.modelParams:
         return
     one, other = _camera(colour), _camera(depth)
+    if _lens(one) != _lens(other):
+        raise NotYetSupportedError(
+            "sensorReadings.cameraReadings.depth.params: its distortion differs from that of the colour camera; send depth that is "
+            "registered to the colour image, with the same distortion, or rectify both images",
+            field="sensorReadings.cameraReadings.depth.params",
+        )
     for focal, size in (("fx", "width"), ("fy", "height"), ("cx", "width"), ("cy", "height")):
         if abs(one[focal] / max(one[size], 1) - other[focal] / max(other[size], 1)) > _SAME_VIEW:
             raise NotYetSupportedError(

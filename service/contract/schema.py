@@ -7,11 +7,15 @@ from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, ValidationInfo, 
 from pydantic.config import JsonDict
 
 from service.errors import NotLocalizedError, RequestError
+from service.geometry.camera import DistortionModel
+from service.geometry.distortion import COEFFICIENTS, LIMITS, coefficient_problem
 from service.option_limits import (
     HEIGHT_STD_M,
     LEAST_FALSE_ACCEPT_RATE,
     LEAST_HEIGHT_M,
     LEAST_HEIGHT_STD_M,
+    LEAST_SIDE,
+    MOST_ASPECT,
     MOST_HEIGHT_M,
     MOST_HEIGHT_STD_M,
     MOST_NEIGHBOURS,
@@ -23,8 +27,8 @@ from service.retrieval.prior import HEADING_STD_DEG, POSITION_STD_M
 #: Limits of a focal length, in widths or heights of the image: 175 and 0.6 degrees of view. A value outside was given in another unit
 #: than pixels.
 LEAST_FOCAL, MOST_FOCAL = 0.02, 100.0
-#: Limits of the sides of an image, pixels, and of their ratio. The longer side determines the memory.
-LEAST_SIDE, MOST_SIDE, MOST_ASPECT = 2, 32768, 16
+#: Longest side of an image, pixels.
+MOST_SIDE = 32768
 #: Limit of the components of a vector whose length does not matter. An accelerometer may use m/s2, thousandths of g or its own steps.
 MOST_COMPONENT = 1e6
 #: Most characters of the token of a belief. A track of eight modes has 1,850.
@@ -75,11 +79,25 @@ class RigidTransform(_Strict):
     orientation: Quaternion
 
 
+def _coefficients(model: DistortionModel) -> str:
+    """Describe the coefficients of a lens and their limits."""
+    counts, limits = COEFFICIENTS[model], dict[float, list[str]]()
+    for name, limit in LIMITS[model]:
+        limits.setdefault(limit, []).append(name)
+    bounds = ", ".join(f"{' '.join(names)} within {limit:g}" for limit, names in limits.items())
+    count = " or ".join(filter(None, (", ".join(map(str, counts[:-1])), str(counts[-1]))))
+    return f"{model}: {count} coefficients of {', '.join(name for name, _ in LIMITS[model])} ({bounds})"
+
+
 class Camera(_Strict):
-    """Intrinsics of the rectified RGB image, pixels. The centre of the first pixel is (0, 0)."""
+    """Intrinsics and lens of both images as sent, pixels. The centre of the first pixel is (0, 0).
+
+    The service rectifies both images if `distortion` or `distortion_model` describes a lens.
+    """
 
     model: Literal["PINHOLE"] = Field(
-        "PINHOLE", description="projection of the rectified images. The service refuses any other model"
+        "PINHOLE",
+        description="projection without the lens. The service refuses any other model; distortion_model names the lens",
     )
     width: int = Field(ge=LEAST_SIDE, le=MOST_SIDE)
     height: int = Field(
@@ -97,11 +115,18 @@ class Camera(_Strict):
     )
     cx: float = Field(ge=-2 * MOST_SIDE, le=2 * MOST_SIDE)
     cy: float = Field(ge=-2 * MOST_SIDE, le=2 * MOST_SIDE)
+    distortion_model: DistortionModel = Field(
+        "brown_conrady",
+        description="lens of both images. brown_conrady: OpenCV's models plumb_bob and rational_polynomial. kannala_brandt: OpenCV's "
+        "fisheye model (equidistant in ROS), which needs four coefficients, also if they are zero",
+    )
     distortion: list[Annotated[float, Field(ge=-1e3, le=1e3)]] = Field(
         default_factory=list,
+        validate_default=True,
         max_length=14,
-        description="distortion coefficients of the images as sent: empty or zero. The service refuses other values: "
-        "rectify the images first",
+        description="distortion coefficients of both images as sent, in OpenCV order. Empty or zeros: the images are rectified. "
+        + "; ".join(_coefficients(model) for model in COEFFICIENTS)
+        + ". The radius must grow from the centre of the image to its corners",
     )
     height_m: float | None = Field(
         None,
@@ -121,9 +146,17 @@ class Camera(_Strict):
     def _is_rectified(cls, model: object) -> object:
         if model != "PINHOLE":
             raise ValueError(
-                "only PINHOLE is supported; rectify both images and send the intrinsics of the rectified images"
+                "only PINHOLE is supported; send the lens as distortion_model and distortion, or rectify both images"
             )
         return model
+
+    @field_validator("distortion")
+    @classmethod
+    def _is_a_lens(cls, distortion: list[float], info: ValidationInfo) -> list[float]:
+        model = info.data.get("distortion_model")  # None: refused itself
+        if model is not None and (problem := coefficient_problem(model, distortion)):
+            raise ValueError(problem)
+        return distortion
 
     @field_validator("fx", "fy")
     @classmethod

@@ -4,10 +4,12 @@ import json
 import math
 from pathlib import Path
 
-from service.contract.convert import parsed
+from service.contract.convert import camera_of, parsed
 from service.contract.schema import Camera, LocalizeRequest
 from service.doctor.finding import Finding
 from service.errors import StreetfixError
+from service.geometry.camera import PinholeCamera
+from service.imaging.rectify import rectification_of
 
 #: Largest distance of the principal point from the centre, as a share of the side.
 OFF_CENTRE = 0.1
@@ -75,11 +77,14 @@ def check_principal_point(camera: Camera) -> Finding:
 
 
 def check_field_of_view(camera: Camera) -> Finding:
-    """Check that the horizontal field of view is that of a usual camera.
+    """Check that the horizontal field of view is that of a usual camera, and name the part that the service keeps.
 
     Args:
         camera: intrinsics of the request.
     """
+    lens = camera_of(camera)
+    if lens.is_distorted:
+        return _field_of_lens(lens)
     across, down = (
         2 * math.degrees(math.atan(0.5 * side / focal))
         for side, focal in ((camera.width, camera.fx), (camera.height, camera.fy))
@@ -88,6 +93,23 @@ def check_field_of_view(camera: Camera) -> Finding:
     if LEAST_VIEW_DEG <= across <= MOST_VIEW_DEG:
         return Finding("field of view", "ok", text)
     remedy = f"usual values are {LEAST_VIEW_DEG:g} to {MOST_VIEW_DEG:g} degrees across; {_CALIBRATION}"
+    return Finding("field of view", "warning", text, remedy)
+
+
+def _field_of_lens(camera: PinholeCamera) -> Finding:
+    """Check the field of the rectified image, which the service uses."""
+    try:
+        pinhole = rectification_of(camera).camera
+    except StreetfixError:  # the check of the distortion names the error
+        text = "unknown, because the images cannot be rectified"
+        return Finding("field of view", "warning", text, "correct camera.distortion first")
+    x, y = (-0.5 - pinhole.cx) / pinhole.fx, (-0.5 - pinhole.cy) / pinhole.fy
+    right, bottom = (pinhole.width - 0.5 - pinhole.cx) / pinhole.fx, (pinhole.height - 0.5 - pinhole.cy) / pinhole.fy
+    across, down = (math.degrees(math.atan(end) - math.atan(begin)) for begin, end in ((x, right), (y, bottom)))
+    text = f"{across:.0f} degrees across and {down:.0f} degrees down in the rectified image of {pinhole.width}x{pinhole.height}"
+    if across >= LEAST_VIEW_DEG:
+        return Finding("field of view", "ok", text)
+    remedy = f"usual values are {LEAST_VIEW_DEG:g} degrees or more across; {_CALIBRATION}"
     return Finding("field of view", "warning", text, remedy)
 
 
@@ -107,16 +129,21 @@ def check_focal_lengths(camera: Camera) -> Finding:
 
 
 def check_distortion(camera: Camera) -> Finding:
-    """Check that the images are rectified, as far as the file tells.
+    """Check that the service can rectify the images.
 
     Args:
         camera: intrinsics of the request.
     """
-    if any(camera.distortion):
-        return Finding(
-            "distortion",
-            "problem",
-            "camera.distortion is not zero, so the images are not rectified, and the service refuses them",
-            "rectify both images (cv2.undistort), then send the intrinsics of the rectified images and no distortion",
-        )
-    return Finding("distortion", "ok", "none given: the images must be rectified")
+    lens = camera_of(camera)
+    if not lens.is_distorted:
+        return Finding("distortion", "ok", "none given: both images must be rectified")
+    try:
+        rectification_of(lens)
+    except StreetfixError as error:
+        return Finding.of_error("distortion", error)
+    return Finding(
+        "distortion",
+        "ok",
+        f"{lens.distortion_model} {[round(each, 4) for each in lens.distortion]}: the service rectifies both images",
+        "both images must have this lens: depth is registered to the distorted colour image, not to a rectified one",
+    )

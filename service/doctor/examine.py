@@ -132,6 +132,6 @@ def _pair(request: LocalizeRequest, rgb: Path, depth: Path) -> Generator[Finding
     if not pair.depth_m.any():
         return None
     yield check_registered(pair.rgb, pair.depth_m)
-    encoded = pair.encoded
-    yield check_ground(ground_of(pair.depth_m, encoded.camera, encoded.down_camera, encoded.camera_height))
+    encoded, flat = pair.encoded, pair.rectified()
+    yield check_ground(ground_of(flat.depth_m, flat.camera, encoded.down_camera, encoded.camera_height))
     return pair

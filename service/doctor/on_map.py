@@ -28,9 +28,9 @@ def rows_of_camera(pair: Pair, bundle: MapBundle) -> Bool[NDArray[np.bool_], " r
         pair: decoded images.
         bundle: the map.
     """
-    encoded, camera = pair.encoded, pair.encoded.camera
-    level, _ = level_query(pair.depth_m, camera, down_camera=encoded.down_camera, given=encoded.camera_height)
-    _, _, seen = gather(pair.rgb, pair.depth_m, camera, level.R_level_camera.T, bundle.grid)
+    encoded, flat = pair.encoded, pair.rectified()
+    level, _ = level_query(flat.depth_m, flat.camera, down_camera=encoded.down_camera, given=encoded.camera_height)
+    _, _, seen = gather(flat.rgb, flat.depth_m, flat.camera, level.R_level_camera.T, bundle.grid, flat.observed)
     columns = int(seen.any(axis=0).sum())
     rows: Bool[NDArray[np.bool_], " rows"] = (seen.sum(axis=1) * 2 >= columns) & (columns > 0)
     return rows

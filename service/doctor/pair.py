@@ -15,6 +15,7 @@ from service.imaging.decode import ASPECT_TOLERANCE, decode_depth, decode_rgb, d
 from service.imaging.depth_formats import read_depth_values
 from service.imaging.depth_unit_hint import FACTORS, USUAL_M
 from service.imaging.picture_headers import DEFAULT_LIMITS
+from service.imaging.rectify import RectifiedPair, rectification_of, rectified_pair
 from service.runtime.engine import EncodedQuery
 
 #: Share of pixels with a depth below which the images tell little.
@@ -26,7 +27,7 @@ Depth = Float32[NDArray[np.float32], "h w"]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Pair:
-    """A decoded image pair.
+    """A decoded image pair, as sent.
 
     Attributes:
         encoded: the query as a service gets it.
@@ -42,6 +43,14 @@ class Pair:
     is_float: bool
     scale_m: float
 
+    def rectified(self) -> RectifiedPair:
+        """Return the images as the service uses them: those of a pinhole camera.
+
+        Raises:
+            RequestError: the distortion is not invertible over the image, or the rectified image would be empty.
+        """
+        return rectified_pair(self.rgb, self.depth_m, self.encoded.camera)
+
     def with_scale(self, scale_m: float) -> "Pair":
         """Return the pair with another ``depth.scale_m``.
 
@@ -53,7 +62,7 @@ class Pair:
 
 
 def encoded_of(request: LocalizeRequest, rgb: bytes, depth: bytes) -> EncodedQuery:
-    """Build the query that a service would get, but without distortion, which has a check of its own.
+    """Build the query that a service would get. A wrong distortion is left out, because it has a check of its own.
 
     Args:
         request: the camera file.
@@ -63,8 +72,14 @@ def encoded_of(request: LocalizeRequest, rgb: bytes, depth: bytes) -> EncodedQue
     Raises:
         StreetfixError: a field contradicts other fields.
     """
-    rectified = request.camera.model_copy(update={"distortion": []})
-    return query_from(request.model_copy(update={"camera": rectified}), rgb=rgb, depth=depth)
+    encoded = query_from(request, rgb=rgb, depth=depth)
+    if not encoded.camera.is_distorted:
+        return encoded
+    try:
+        rectification_of(encoded.camera)
+    except StreetfixError:  # the check of the distortion names the error
+        return replace(encoded, camera=replace(encoded.camera, distortion=(), distortion_model="brown_conrady"))
+    return encoded
 
 
 def check_images(encoded: EncodedQuery) -> tuple[Finding, Pair | None]:

@@ -1,15 +1,19 @@
-"""The pinhole camera model. Pixels are (u, v). The centre of the first pixel is at (0, 0)."""
+"""The pinhole camera model, and the lens before it. Pixels are (u, v). The centre of the first pixel is at (0, 0)."""
 
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 from jaxtyping import Float64
 from numpy.typing import NDArray
 
+#: Model of a distorting lens: OpenCV's polynomial and rational model, or that of ``cv2.fisheye``.
+DistortionModel = Literal["brown_conrady", "kannala_brandt"]
+
 
 @dataclass(frozen=True, slots=True)
 class PinholeCamera:
-    """Intrinsics of a pinhole camera.
+    """Intrinsics of a camera.
 
     Attributes:
         width: image width, pixels.
@@ -19,6 +23,8 @@ class PinholeCamera:
         cx: u of the principal point, pixels.
         cy: v of the principal point, pixels.
         distortion: distortion coefficients in OpenCV order. Empty for rectified images.
+        distortion_model: model of the lens. ``brown_conrady`` without coefficients, or with zeros, is a pinhole.
+            ``kannala_brandt`` never is: four zeros are an equidistant fisheye lens.
     """
 
     width: int
@@ -28,6 +34,12 @@ class PinholeCamera:
     cx: float
     cy: float
     distortion: tuple[float, ...] = ()
+    distortion_model: DistortionModel = "brown_conrady"
+
+    @property
+    def is_distorted(self) -> bool:
+        """Whether the image differs from that of a pinhole camera."""
+        return self.distortion_model == "kannala_brandt" or any(self.distortion)
 
     @property
     def matrix(self) -> Float64[NDArray[np.float64], "3 3"]:
@@ -52,6 +64,7 @@ class PinholeCamera:
             (self.cx + 0.5) * sx - 0.5,
             (self.cy + 0.5) * sy - 0.5,
             self.distortion,
+            self.distortion_model,
         )
 
     def rays_of_pixels(self) -> Float64[NDArray[np.float64], "H W 3"]:

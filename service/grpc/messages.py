@@ -23,6 +23,11 @@ _ENCODINGS = {
     pb.DEPTH_ENCODING_COMPRESSED_DEPTH: "compressed_depth",
 }
 _MODELS = {pb.CAMERA_MODEL_UNSPECIFIED: "PINHOLE", pb.CAMERA_MODEL_PINHOLE: "PINHOLE"}
+_LENSES = {
+    pb.DISTORTION_MODEL_UNSPECIFIED: "brown_conrady",
+    pb.DISTORTION_MODEL_BROWN_CONRADY: "brown_conrady",
+    pb.DISTORTION_MODEL_KANNALA_BRANDT: "kannala_brandt",
+}
 #: One more than the contract allows. So too many coefficients are refused, and a message with millions does not become a large list.
 _MOST_COEFFICIENTS = 15
 _STATUS = {
@@ -119,6 +124,7 @@ def _camera(message: pb.Camera) -> dict[str, Any]:
         | _given(message, "height_m", "height_std_m")
         | {
             "model": _MODELS.get(message.model, message.model),
+            "distortion_model": _LENSES.get(message.distortion_model, message.distortion_model),
             "distortion": list(message.distortion[:_MOST_COEFFICIENTS]),
         }
     )

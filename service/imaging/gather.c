@@ -10,12 +10,14 @@
 
 #include "picture.h"
 
-enum { SAMPLES = 9, BLOCK = 128 };
+/* ARGUMENTS: of streetfix_gather. */
+enum { SAMPLES = 9, BLOCK = 128, ARGUMENTS = 14 };
 
 /* Compared with Python's structures when the library is loaded. */
 const LayoutEntry streetfix_layout[] = {
     PICTURE_LAYOUT,
     LAYOUT_CONSTANT(SAMPLES),
+    LAYOUT_CONSTANT(ARGUMENTS),
     LAYOUT_END,
 };
 
@@ -55,11 +57,12 @@ static const int NETWORK[25][2] = {{0, 1}, {3, 4}, {6, 7}, {1, 2}, {4, 5}, {7, 8
                                    {4, 7}, {1, 4}, {2, 5}, {5, 8}, {2, 5}, {1, 3}, {5, 7}, {2, 6}, {4, 6}, {2, 4}, {2, 3}, {5, 6}};
 
 /* rays: SAMPLES x 3 x cells, level frame of the view. R: rotation from this frame to the optical frame, row-major.
- * depth: z, metres. min_range, max_range: metres. fewest: rays with a measurement that a range needs.
+ * depth: z, metres. observed: 0 for pixels of the depth image that no sensor saw, of the size of depth; NULL: all were seen.
+ * min_range, max_range: metres. fewest: rays with a measurement that a range needs.
  * Output: ranges (metres, 0 without a range) and seen have one value per cell, colour (0..255) has cells x 3 values. */
 void streetfix_gather(const float *rays, int64_t cells, const double *R, const float *depth, const Picture *depth_picture,
-                      const uint8_t *rgb, const Picture *rgb_picture, double min_range, double max_range, int64_t fewest, float *ranges,
-                      float *colour, uint8_t *seen)
+                      const uint8_t *observed, const uint8_t *rgb, const Picture *rgb_picture, double min_range, double max_range,
+                      int64_t fewest, float *ranges, float *colour, uint8_t *seen)
 {
     float r[9];
     for (int k = 0; k < 9; k++) r[k] = (float)R[k];
@@ -82,6 +85,9 @@ void streetfix_gather(const float *rays, int64_t cells, const double *R, const f
             }
             project(x, y, z, count, depth_picture, depth_pixel);
             if (!same_picture) project(x, y, z, count, rgb_picture, rgb_pixel);
+            if (observed)
+                for (int64_t i = 0; i < count; i++)
+                    if (depth_pixel[i] >= 0 && !observed[depth_pixel[i]]) depth_pixel[i] = rgb_pixel[i] = -1;
             const int32_t *colour_pixel = same_picture ? depth_pixel : rgb_pixel;
             for (int64_t i = 0; i < count; i++) {
                 float range = INFINITY;

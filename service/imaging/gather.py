@@ -8,6 +8,7 @@ import ctypes
 from ctypes import POINTER, byref, c_double, c_int64, c_void_p
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float32, UInt8
@@ -40,11 +41,12 @@ def finest_rad(grid: ViewGrid) -> float:
 
 @cache
 def _library() -> ctypes.CDLL:
-    library = load(LIBRARY, {"Picture": CPicture}, {"SAMPLES": SUB_RAYS**2})
-    library.streetfix_gather.argtypes = [
-        c_void_p, c_int64, c_void_p, c_void_p, POINTER(CPicture), c_void_p, POINTER(CPicture), c_double, c_double, c_int64,
+    arguments: list[Any] = [
+        c_void_p, c_int64, c_void_p, c_void_p, POINTER(CPicture), c_void_p, c_void_p, POINTER(CPicture), c_double, c_double, c_int64,
         c_void_p, c_void_p, c_void_p,
     ]  # fmt: skip
+    library = load(LIBRARY, {"Picture": CPicture}, {"SAMPLES": SUB_RAYS**2, "ARGUMENTS": len(arguments)})
+    library.streetfix_gather.argtypes = arguments
     library.streetfix_gather.restype = None
     return library
 
@@ -55,6 +57,7 @@ def gather(
     camera: PinholeCamera,
     R_camera_view: Rotation,
     grid: ViewGrid,
+    observed: Bool[NDArray[np.bool_], "h w"] | None = None,
 ) -> tuple[
     Float32[NDArray[np.float32], "rows columns"],
     Float32[NDArray[np.float32], "rows columns 3"],
@@ -68,6 +71,7 @@ def gather(
         camera: pinhole intrinsics, pixels.
         R_camera_view: rotation from the level frame of the view (x along its heading, z up) to the optical frame, (3, 3).
         grid: view grid.
+        observed: pixels of the depth image that the sensor could see; None: all. A ray that hits another pixel hits nothing.
 
     Returns:
         ranges: median range in metres. 0 where fewer than ``FEWEST_SAMPLES`` rays hit a measurement within the grid's limits.
@@ -75,12 +79,16 @@ def gather(
         seen: whether a ray of the cell hits the depth image.
 
     Raises:
-        ValueError: ``rgb`` is not (H, W, 3), or ``depth_m`` is not (h, w).
+        ValueError: ``rgb`` is not (H, W, 3), or ``depth_m`` and ``observed`` are not (h, w).
     """
     # The compiled code trusts these shapes and reads memory by them.
     rgb, depth_m = np.ascontiguousarray(rgb, np.uint8), np.ascontiguousarray(depth_m, np.float32)
     if rgb.ndim != 3 or rgb.shape[2] != 3 or depth_m.ndim != 2:
         raise ValueError(f"rgb {rgb.shape} must be (H, W, 3), and depth {depth_m.shape} must be (h, w)")
+    if observed is not None:
+        observed = np.ascontiguousarray(observed, np.bool_)
+        if observed.shape != depth_m.shape:
+            raise ValueError(f"observed {observed.shape} must have the shape of the depth image {depth_m.shape}")
     rays = _sub_rays(grid)
     cells = grid.rows * grid.columns
     R = np.ascontiguousarray(R_camera_view, np.float64).reshape(3, 3)
@@ -92,6 +100,7 @@ def gather(
         R.ctypes.data,
         depth_m.ctypes.data,
         byref(c_picture(camera, depth_m)),
+        None if observed is None else observed.ctypes.data,
         rgb.ctypes.data,
         byref(c_picture(camera, rgb)),
         grid.min_range_m,

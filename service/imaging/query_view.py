@@ -65,6 +65,7 @@ def query_view(
     down_camera: Float64[NDArray[np.float64], "3"] | None = None,
     given_height: GivenHeight | None = None,
     turn_rad: float = 0.0,
+    observed: Bool[NDArray[np.bool_], "h w"] | None = None,
 ) -> QueryView:
     """Compute one view of a query at any heading. ``query_views`` describes the method.
 
@@ -77,6 +78,7 @@ def query_view(
         down_camera: direction of gravity in the camera frame, any length, if known.
         given_height: height of the camera above the ground, if the caller knows it. None: it is found in the depth image.
         turn_rad: heading of the view relative to the optical axis, counter-clockwise, radians.
+        observed: pixels of the depth image that the lens saw; None: all.
 
     Raises:
         NoDepthError: no cell of the grid holds a measurement (raised by ``query_views``).
@@ -91,6 +93,7 @@ def query_view(
         turn_rad=turn_rad,
         down_camera=down_camera,
         given_height=given_height,
+        observed=observed,
     )
     return QueryView(views.planes[0], views.R_level_camera, views.height_m, views.measured_share)
 
@@ -106,6 +109,7 @@ def query_views(
     turn_rad: float = 0.0,
     down_camera: Float64[NDArray[np.float64], "3"] | None = None,
     given_height: GivenHeight | None = None,
+    observed: Bool[NDArray[np.bool_], "h w"] | None = None,
 ) -> QueryViews:
     """Level a query, resample it to the view grid, and fuse colour and depth (paper, section 3, testing stage).
 
@@ -121,6 +125,7 @@ def query_views(
         turn_rad: heading relative to the optical axis that ``turns`` start from, counter-clockwise, radians.
         down_camera: direction of gravity in the camera frame, any length, if known.
         given_height: height of the camera above the ground, if the caller knows it. None: it is found in the depth image.
+        observed: pixels of the depth image that the lens saw; None: all. A cell without such a pixel is not observed.
 
     Raises:
         NoDepthError: no cell of the grid holds a measurement.
@@ -128,7 +133,7 @@ def query_views(
     level, height_origin = level_query(depth_m, camera, down_camera=down_camera, given=given_height)
     aside = max(abs(turn) for turn in turns)
     R_camera_view = level.R_level_camera.T @ rotation_z(turn_rad)
-    ranges, colour, seen = gather(rgb, depth_m, camera, R_camera_view, grid.widened(aside))
+    ranges, colour, seen = gather(rgb, depth_m, camera, R_camera_view, grid.widened(aside), observed)
     seen &= rows_seen[:, None]
     ranges *= seen
     colour *= seen[..., None]

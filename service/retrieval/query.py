@@ -3,9 +3,10 @@
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float32, Float64, UInt8
+from jaxtyping import Bool, Float32, Float64, UInt8
 from numpy.typing import NDArray
 
+from service.errors import RequestError
 from service.geometry.camera import PinholeCamera
 from service.geometry.rigid import Transform
 from service.imaging.decode import (
@@ -20,6 +21,7 @@ from service.imaging.decode import (
 from service.imaging.gather import finest_rad
 from service.imaging.level import GivenHeight
 from service.imaging.picture_headers import DEFAULT_LIMITS
+from service.imaging.rectify import rectification_of, rectified_pair
 from service.imaging.view_grid import ViewGrid
 from service.option_limits import FALSE_ACCEPT_RATE, NEIGHBOURS
 from service.retrieval.prior import Prior
@@ -43,6 +45,7 @@ class Query:
         baseline_m: baseline of the stereo rig that measured the depth; None if no rig is known. With a baseline, registration also
             estimates the disparity offset, and the depth noise is at least that of stereo matching.
         false_accept_rate: largest tolerated share of out-of-map queries that become LOCALIZED, 0 to 1.
+        observed: pixels of the depth image that the lens saw; None: all. A rectified image has others.
     """
 
     rgb: UInt8[NDArray[np.uint8], "H W 3"]
@@ -57,6 +60,46 @@ class Query:
     prior: Prior | None = None
     baseline_m: float | None = None
     false_accept_rate: float = FALSE_ACCEPT_RATE
+    observed: Bool[NDArray[np.bool_], "h w"] | None = None
+
+    def __post_init__(self) -> None:
+        """Refuse images that are not rectified.
+
+        Raises:
+            RequestError: the camera has distortion.
+        """
+        if self.camera.is_distorted:
+            raise RequestError(
+                "camera.distortion: a Query has the images of a pinhole camera, but this camera has distortion; make the query by "
+                "Query.of_images, which rectifies both images",
+                field="camera.distortion",
+            )
+
+    @classmethod
+    def of_images(
+        cls,
+        rgb: UInt8[NDArray[np.uint8], "H W 3"],
+        depth_m: Float32[NDArray[np.float32], "h w"],
+        camera: PinholeCamera,
+        *,
+        baseline_m: float | None = None,
+    ) -> "Query":
+        """Rectify an image pair, and build the query that has the default options.
+
+        Args:
+            rgb: sRGB image with the aspect ratio of the camera.
+            depth_m: z of each pixel of the sent image, metres, 0 where nothing was measured. It has the aspect ratio of the camera.
+            camera: intrinsics and distortion of both images.
+            baseline_m: baseline of the stereo rig that measured the depth; None if no rig is known.
+
+        Raises:
+            RequestError: the distortion is not invertible over the image, or the rectified image would be empty.
+            TooLargeError: a side of a distorted image is too long.
+        """
+        pair = rectified_pair(rgb, depth_m, camera)
+        return cls(
+            rgb=pair.rgb, depth_m=pair.depth_m, camera=pair.camera, observed=pair.observed, baseline_m=baseline_m
+        )
 
     @property
     def focal_baseline_px_m(self) -> float | None:
@@ -95,19 +138,21 @@ def decoded_query(
     grid: ViewGrid,
     limits: ImageLimits = DEFAULT_LIMITS,
 ) -> Query:
-    """Decode an image pair to a query that has the default options.
+    """Decode and rectify an image pair to a query that has the default options.
 
     Args:
         rgb: encoded colour image.
         depth: encoded depth image.
-        camera: intrinsics of both images; each image may be scaled uniformly.
+        camera: intrinsics and distortion of both images; each image may be scaled uniformly.
         depth_format: meaning of the stored depth numbers.
         grid: view grid of the map. Colour finer than the grid needs is decoded at a fraction of its size.
         limits: largest size of each image.
 
     Raises:
-        StreetfixError: as in ``decode_rgb``, ``decode_depth`` and ``require_sizes``.
+        StreetfixError: as in ``decode_rgb``, ``decode_depth``, ``require_sizes`` and ``rectified_pair``.
     """
+    if camera.is_distorted:
+        rectification_of(camera)  # refuses a wrong model before the images cost time
     colour = decode_rgb(rgb, limits=limits, camera=camera, finest_rad=finest_rad(grid))
     depth_m = decode_depth(
         depth,
@@ -120,4 +165,4 @@ def decoded_query(
         limits=limits,
     )
     require_sizes(colour, depth_m, camera, rgb_size=stored_size(rgb))
-    return Query(rgb=colour, depth_m=depth_m, camera=camera, baseline_m=depth_format.baseline_m)
+    return Query.of_images(colour, depth_m, camera, baseline_m=depth_format.baseline_m)

@@ -65,6 +65,7 @@ def look_up(bundle: MapBundle, encoder: Encoder, query: Query, clusters: Cluster
             rows_seen=bundle.rows_seen,
             down_camera=query.down_camera,
             given_height=query.camera_height,
+            observed=query.observed,
         )
     with timer.stage("encode"):
         descriptors = encoder.encode(views.planes, side="query")

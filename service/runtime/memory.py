@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from service.errors import RequestError
+from service.imaging.rectify import TABLES_BYTES
 from service.runtime.admission import MIB, MemoryBudget, in_mib
 
 if TYPE_CHECKING:
@@ -54,7 +55,7 @@ def budget_of(settings: "Settings", *, threads: int) -> MemoryBudget:
     if settings.request_memory_mib is None:
         limit = memory_limit()
         shared = limit * (SPARE_SHARE + MAPS_SHARE)
-        process = max(anonymous_bytes(), PROCESS_BYTES) + threads * THREAD_BYTES
+        process = max(anonymous_bytes(), PROCESS_BYTES) + threads * THREAD_BYTES + TABLES_BYTES
         if settings.grpc_port is not None:
             process += round((GRPC_COPIES + GRPC_PARSED + GRPC_OTHERS) * message)
         left = int((limit - shared) / settings.workers - process)

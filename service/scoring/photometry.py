@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from jaxtyping import Float32, Int32, UInt8
+from jaxtyping import Bool, Float32, Int32, UInt8
 from numpy.typing import NDArray
 
 from service.geometry.camera import PinholeCamera
@@ -62,6 +62,23 @@ def grey_of(
     small = cv2.resize(grey, (camera.width, camera.height), interpolation=cv2.INTER_AREA)
     logarithm: Float32[NDArray[np.float32], "H W"] = np.log(small.astype(np.float32) + np.float32(settings.dark_grey))
     return logarithm
+
+
+def seen_by_lens(
+    observed: Bool[NDArray[np.bool_], "h w"], camera: PinholeCamera, covered: tuple[float, float]
+) -> Bool[NDArray[np.bool_], "H W"]:
+    """Mark the pixels of a small image that only show pixels that the lens saw.
+
+    Args:
+        observed: pixels of the depth image that the lens saw.
+        camera: intrinsics of the small image.
+        covered: shares of the image's width and height that the small image covers, from the left and from the top.
+    """
+    height, width = (max(1, round(side * share)) for side, share in zip(observed.shape, covered[::-1], strict=True))
+    part = observed[:height, :width].astype(np.float32)
+    small = cv2.resize(part, (camera.width, camera.height), interpolation=cv2.INTER_AREA)
+    seen: Bool[NDArray[np.bool_], "H W"] = small > 0.999
+    return seen
 
 
 def agreement_of_brightness(
@@ -147,6 +164,7 @@ class BrightnessScorer:
     ) -> None:
         self._raycaster, self._measured, self._settings = raycaster, measured, settings
         self._greys: list[Float32[NDArray[np.float32], "H W"]] | None = None
+        self._seen: list[Bool[NDArray[np.bool_], "H W"] | None] = []
 
     @property
     def is_known(self) -> bool:
@@ -167,6 +185,12 @@ class BrightnessScorer:
                 grey_of(each.frame.query.rgb, each.blocks.camera, each.blocks.covered, self._settings)
                 for each in self._measured
             ]
+            self._seen = [
+                None
+                if each.frame.query.observed is None
+                else seen_by_lens(each.frame.query.observed, each.blocks.camera, each.blocks.covered)
+                for each in self._measured
+            ]
         return Scores(np.array([self._mean(brightness, self._greys, pose) for pose in poses]))
 
     def _mean(
@@ -175,6 +199,11 @@ class BrightnessScorer:
         greys: list[Float32[NDArray[np.float32], "H W"]],
         pose: Registered,
     ) -> float:
-        surfel_of = cast_rays(self._raycaster, [each.picture for each in self._measured], pose)
+        surfel_of = [
+            own if seen is None else np.where(seen, own, np.int32(-1))
+            for own, seen in zip(
+                cast_rays(self._raycaster, [each.picture for each in self._measured], pose), self._seen, strict=True
+            )
+        ]
         pairs = zip(surfel_of, greys, strict=True)
         return float(np.mean([agreement_of_brightness(brightness, own, grey, self._settings) for own, grey in pairs]))

@@ -9,10 +9,13 @@ from typing import Any
 
 import grpc
 import httpx
+import numpy as np
 import pytest
 import uvicorn
 from google.protobuf.json_format import MessageToDict
 
+from service.geometry.camera import PinholeCamera
+from service.geometry.distortion import rays_of
 from service.grpc.generated.streetfix.v1 import localization_pb2 as pb
 from service.grpc.generated.streetfix.v1.localization_pb2_grpc import LocalizationServiceStub
 from service.grpc.server import GrpcServer
@@ -113,6 +116,78 @@ def test_one_pair(faces: Any, parts_of: Parts, changed: dict[str, Any], message:
     is_given = "vehicle_base_on_ground" in changed or "camera" in changed
     assert rest["camera_height"]["origin"] == ("given" if is_given else "estimated")
     assert rest["camera_height"]["height_m"] == pytest.approx(1.5, abs=0.1)
+
+
+#: The lens, its number in the proto, and how far it may move the answer, metres.
+LENSES = [
+    (PinholeCamera(128, 96, 64.0, 64.0, 63.5, 47.5, (-0.1, 0.02, 0.001, 0.0, 0.0)), pb.DISTORTION_MODEL_BROWN_CONRADY),
+    (
+        PinholeCamera(128, 96, 80.0, 80.0, 63.5, 47.5, (0.01, 0.0, 0.0, 0.0), "kannala_brandt"),
+        pb.DISTORTION_MODEL_KANNALA_BRANDT,
+    ),
+]
+
+
+@pytest.mark.parametrize(("lens", "number"), LENSES, ids=lambda each: getattr(each, "distortion_model", ""))
+@pytest.mark.parametrize("kind", ["z", "range"])
+def test_a_pair_through_a_lens(
+    faces: Any, parts_of: Parts, pictures_through: Any, png_and_npy: Any, lens: PinholeCamera, number: int, kind: Any
+) -> None:
+    """Both faces rectify the same images to the same answer, near that of the pinhole camera."""
+    client, stub = faces
+    rgb, depth_m = pictures_through(lens)
+    if kind == "range":
+        pixels = np.stack(np.meshgrid(np.arange(lens.width), np.arange(lens.height)), axis=-1)
+        depth_m = (depth_m / rays_of(lens, pixels.astype(np.float64))[..., 2]).astype(np.float32)
+    names = ("width", "height", "fx", "fy", "cx", "cy", "distortion_model")
+    camera = {name: getattr(lens, name) for name in names} | {"distortion": list(lens.distortion)}
+    document = {"camera": camera, "depth": {"scale_m": 1, "kind": kind}}
+    parts = png_and_npy(rgb, depth_m) | {"request": json.dumps(document).encode()}
+    rest = posted(client, "/v1/localize", parts)
+    message = pb.Camera(**camera | {"distortion_model": number})
+    depth_format = pb.DepthFormat(scale_m=1, kind=pb.DEPTH_KIND_RANGE if kind == "range" else pb.DEPTH_KIND_Z)
+    request = pb.LocalizeRequest(**pair(parts), camera=message, depth_format=depth_format)
+    assert of_message(stub.Localize(request)) == flat(rest)
+    plain = posted(client, "/v1/localize", parts_of())
+    for axis in "xyz":
+        assert rest["pose"]["position"][axis] == pytest.approx(plain["pose"]["position"][axis], abs=0.1)
+    assert rest["camera_height"]["height_m"] == pytest.approx(1.5, abs=0.1)
+
+
+@pytest.mark.parametrize("distortion", [[0.0], [0.0] * 4, [0.0] * 14])
+def test_zero_coefficients_give_the_answer_of_no_distortion(
+    faces: Any, parts_of: Parts, distortion: list[float]
+) -> None:
+    client, stub = faces
+    parts = parts_of()
+    plain = posted(client, "/v1/localize", parts)
+    document = json.loads(parts["request"])
+    document["camera"]["distortion"] = distortion
+    rest = posted(client, "/v1/localize", parts | {"request": json.dumps(document).encode()})
+    assert flat(rest) == flat(plain)
+    bent = pb.Camera(distortion=distortion)
+    bent.MergeFrom(CAMERA)
+    assert of_message(stub.Localize(pb.LocalizeRequest(**pair(parts), camera=bent, depth_format=DEPTH))) == flat(plain)
+
+
+@pytest.mark.parametrize(
+    ("lens", "text"),
+    [({"distortion": [-0.3, 0, 0, 0]}, "stops growing"), ({"distortion": [0.1]}, "does not have 1 coefficients")],
+)
+def test_a_wrong_lens_is_refused_with_the_same_words(faces: Any, parts_of: Parts, lens: Any, text: str) -> None:
+    client, stub = faces
+    parts = parts_of()
+    document = json.loads(parts["request"])
+    document["camera"] |= lens
+    parts |= {"request": json.dumps(document).encode()}
+    problem = client.post("/v1/localize", files={name: (name, data) for name, data in parts.items()}).json()
+    assert (problem["code"], problem["field"]) == ("request", "camera.distortion")
+    assert text in problem["detail"]
+    bent = pb.Camera(**lens)
+    bent.MergeFrom(CAMERA)
+    with pytest.raises(grpc.RpcError) as caught:
+        stub.Localize(pb.LocalizeRequest(**pair(parts), camera=bent, depth_format=DEPTH))
+    assert caught.value.details() == problem["detail"]
 
 
 def test_a_sequence(faces: Any, parts_of: Parts) -> None:

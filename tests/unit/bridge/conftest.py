@@ -38,6 +38,7 @@ def info(stamp_ns: int = 0, **changed: Any) -> Any:
         "header": header_of(stamp_ns),
         "height": 4,
         "width": 6,
+        "distortion_model": "plumb_bob",
         "d": [],
         "k": [3.0, 0, 2.5, 0, 3.5, 1.5, 0, 0, 1],
         "p": [0.0] * 12,

@@ -1,3 +1,4 @@
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -32,3 +33,26 @@ def test_a_camera_height_that_is_given_counts_without_a_service_too(bundle_path:
         answer = InPlace(bundle_path, given)(*pictures)
         assert answer.camera_height is not None
         assert (answer.camera_height.origin, round(answer.camera_height.height_m, 1)) == (origin, 1.5)
+
+
+def test_a_lens_is_rectified_without_a_service_too(bundle_path: Path, pictures: Any, pictures_through: Any) -> None:
+    lens = PinholeCamera(128, 96, 80.0, 80.0, 63.5, 47.5, (0.01, 0.0, 0.0, 0.0), "kannala_brandt")
+    localize = InPlace(bundle_path)
+    rgb, depth_m = pictures_through(lens)
+    plain, bent = localize(*pictures), localize(rgb, depth_m, lens)
+    assert bent.pose is not None
+    assert plain.pose is not None
+    for axis in "xyz":
+        assert getattr(bent.pose.position, axis) == pytest.approx(getattr(plain.pose.position, axis), abs=0.1)
+
+
+def test_a_lens_beyond_the_contracts_bounds_is_refused_without_a_service_too(bundle_path: Path, pictures: Any) -> None:
+    rgb, depth_m, camera = pictures
+    for distortion, why in (
+        ((0.1, 0.0), "does not have 2"),
+        ((0.0, 0.0, 9.0, 0.0), "p1 = 9"),
+        ((-0.3, 0.0, 0.0, 0.0), "stops"),
+    ):
+        with pytest.raises(RequestError, match=why) as caught:
+            InPlace(bundle_path)(rgb, depth_m, replace(camera, distortion=distortion))
+        assert caught.value.field == "camera.distortion"

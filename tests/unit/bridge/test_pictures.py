@@ -8,9 +8,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from service.bridge.pictures import camera_from, depth_from, rgb_from
+from service.bridge.pictures import camera_from, depth_from, is_rectified_by_name, rgb_from
 from service.errors import RequestError
-from service.geometry.camera import PinholeCamera
+from service.geometry.camera import DistortionModel, PinholeCamera
 
 Image = Callable[..., Any]
 RGB = np.arange(2 * 3 * 3, dtype=np.uint8).reshape(2, 3, 3)
@@ -103,8 +103,44 @@ def test_a_camera_without_calibration_is_told(info_of: Image, wrong: dict[str, A
         camera_from(info_of(**wrong), "/i")
 
 
-def test_a_lens_that_distorts_needs_a_word(info_of: Image) -> None:
-    message = info_of(d=[0.1, 0.0, 0.0, 0.0, 0.0])
-    with pytest.raises(RequestError, match=r"/i: the lens distorts .*--rectified"):
+@pytest.mark.parametrize(
+    ("model", "d", "lens"),
+    [
+        ("plumb_bob", [-0.3, 0.1, 0.0, 0.0, 0.0], "brown_conrady"),
+        ("", [-0.3, 0.1, 0.0, 0.0], "brown_conrady"),
+        ("rational_polynomial", [0.5, -2.6, 0.0, 0.0, 1.5, 0.38, -2.4, 1.4], "brown_conrady"),
+        ("equidistant", [0.1, 0.0, 0.0, 0.0], "kannala_brandt"),
+        ("equidistant", [0.0, 0.0, 0.0, 0.0], "kannala_brandt"),
+    ],
+)
+def test_a_raw_image_has_k_and_the_lens(info_of: Image, model: str, d: list[float], lens: DistortionModel) -> None:
+    p = [2.0, 0, 2.1, 0, 0, 2.2, 1.1, 0, 0, 0, 1, 0]
+    message = info_of(distortion_model=model, d=d, p=p)
+    assert camera_from(message, "/i") == PinholeCamera(6, 4, 3.0, 3.5, 2.5, 1.5, tuple(d), lens)
+    assert camera_from(message, "/i", rectified=True) == PinholeCamera(6, 4, 2.0, 2.2, 2.1, 1.1)
+
+
+def test_a_lens_without_distortion_is_a_pinhole(info_of: Image) -> None:
+    p = [2.0, 0, 2.1, 0, 0, 2.2, 1.1, 0, 0, 0, 1, 0]
+    for lens in ({"distortion_model": "plumb_bob", "d": [0.0] * 5}, {"distortion_model": "equidistant", "d": []}):
+        assert camera_from(info_of(p=p, **lens), "/i") == PinholeCamera(6, 4, 2.0, 2.2, 2.1, 1.1)
+
+
+def test_a_lens_that_the_service_does_not_know_needs_rectified_images(info_of: Image) -> None:
+    message = info_of(distortion_model="omni", d=[0.1, 0.0, 0.0, 0.0])
+    with pytest.raises(RequestError, match=r"/i: the distortion_model 'omni' is not known .*equidistant.*--rectified"):
         camera_from(message, "/i")
     assert camera_from(message, "/i", rectified=True).fx == 3.0
+
+
+@pytest.mark.parametrize(
+    ("topic", "is_rectified"),
+    [
+        ("/camera/image_rect_color", True),
+        ("/camera/image_rect/compressed", True),
+        ("/camera/image_raw", False),
+        ("/rectory/image_raw/compressed", False),
+    ],
+)
+def test_a_topics_name_says_whether_it_is_rectified(topic: str, is_rectified: bool) -> None:
+    assert is_rectified_by_name(topic) == is_rectified

@@ -5,6 +5,7 @@ import pytest
 
 from service.cli.main import main
 from service.doctor import machine
+from service.geometry.camera import PinholeCamera
 
 
 def run(*arguments):
@@ -56,6 +57,21 @@ def test_all_checks_run_where_all_is_given(capsys, files, bundle_path):
     assert checks_of(out) == [*MACHINE, *MAP, *CAMERA, *PAIR, "same heights", "answer"]
     assert "ok       answer: LOCALIZED (no confidence)" in out
     assert "warning  calibration: the map is not calibrated" in out
+
+
+@pytest.mark.usefixtures("free")
+def test_images_of_a_lens_get_all_checks_and_an_answer(capsys, files, bundle_path, pictures_through, png_and_npy):
+    lens = PinholeCamera(128, 96, 80.0, 80.0, 63.5, 47.5, (0.01, 0.0, 0.0, 0.0), "kannala_brandt")
+    for name, part in png_and_npy(*pictures_through(lens)).items():
+        files[name].write_bytes(part)
+    camera = {name: getattr(lens, name) for name in ("width", "height", "fx", "fy", "cx", "cy", "distortion_model")}
+    document = {"camera": camera | {"distortion": list(lens.distortion)}, "depth": {"scale_m": 1}}
+    files["camera"].write_text(json.dumps(document))
+    assert run("--map", str(bundle_path), *options_of(files)) == 0
+    out = capsys.readouterr().out
+    assert checks_of(out) == [*MACHINE, *MAP, *CAMERA, *PAIR, "same heights", "answer"]
+    assert "ok       distortion: kannala_brandt [0.01, 0.0, 0.0, 0.0]: the service rectifies both images" in out
+    assert "ok       answer: LOCALIZED (no confidence)" in out
 
 
 @pytest.mark.usefixtures("free")

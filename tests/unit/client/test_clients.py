@@ -5,6 +5,7 @@ import email
 import email.policy
 import json
 from collections.abc import Callable
+from dataclasses import replace
 from datetime import UTC, datetime
 from typing import Any
 
@@ -112,6 +113,32 @@ def test_files_are_sent_unchanged_and_leave_the_scale_to_the_service(ask: Asking
     assert (sequence["rgb0"], sequence["depth0"][:4]) == (b"a JPEG", b"SFD1")
     assert (scaled["rgb"][:2], scaled["depth"]) == (b"\xff\xd8", b"a PNG")
     assert json.loads(scaled["request"])["depth"]["scale_m"] == 0.0002
+
+
+def test_only_a_fisheye_lens_sends_its_model(ask: Asking, answer_json: Json) -> None:
+    """An earlier service refuses unknown fields. It refuses coefficients by itself."""
+    seen: list[httpx.Request] = []
+
+    def handler(request: httpx.Request) -> httpx.Response:
+        seen.append(request)
+        return httpx.Response(200, json=answer_json())
+
+    bent = replace(CAMERA, distortion=(-0.3, 0.1, 0.0, 0.0))
+    fisheye = replace(CAMERA, distortion=(0.0,) * 4, distortion_model="kannala_brandt")
+    told = SchemaCamera(
+        width=6, height=4, fx=3, fy=3, cx=2.5, cy=1.5, distortion=[0.1, 0, 0, 0], distortion_model="kannala_brandt"
+    )
+    for camera in (CAMERA, bent, fisheye, told):
+        ask(handler, "localize", RGB, DEPTH, camera)
+    lenses = [json.loads(parts_of(each)["request"])["camera"] for each in seen]
+    assert [each["distortion"] for each in lenses] == [[], [-0.3, 0.1, 0, 0], [0, 0, 0, 0], [0.1, 0, 0, 0]]
+    assert [each.get("distortion_model") for each in lenses] == [None, None, "kannala_brandt", "kannala_brandt"]
+
+
+def test_a_lens_with_too_few_coefficients_is_refused_before_it_is_sent(ask: Asking) -> None:
+    camera = replace(CAMERA, distortion=(0.1,))
+    with pytest.raises(RequestError, match=r"camera\.distortion: the model brown_conrady does not have 1 coefficients"):
+        ask(lambda _: httpx.Response(500), "localize", RGB, DEPTH, camera)
 
 
 @pytest.mark.parametrize(("rgb", "depth", "field"), [(b"", DEPTH, "rgb"), (RGB, b"", "depth")])

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from typing import Any
 
 import grpc
@@ -31,6 +32,7 @@ from service.errors import (
     UnknownMapError,
     UnreachableError,
 )
+from service.geometry.camera import DistortionModel
 from service.grpc.generated.streetfix.v1 import localization_pb2 as pb
 from service.grpc.generated.streetfix.v1.localization_pb2_grpc import (
     LocalizationServiceServicer,
@@ -124,6 +126,32 @@ def test_a_request_is_read_by_the_service_as_written(client: GrpcClient, told: T
     assert read.vehicle_base_on_ground
     assert told.asked[0].depth.startswith(b"SFD1")
     assert told.metadata["authorization"] == "Bearer k"
+
+
+@pytest.mark.parametrize(
+    ("distortion", "model"),
+    [
+        ((), "brown_conrady"),
+        ((-0.3, 0.1, 0.0, 0.0), "brown_conrady"),
+        ((0.0, 0.0, 0.0, 0.0), "kannala_brandt"),
+    ],
+)
+def test_the_lens_is_read_by_the_service_as_written(
+    client: GrpcClient, told: Told, answer_json: Json, distortion: tuple[float, ...], model: DistortionModel
+) -> None:
+    told.answers = [answer_message(schema.LocalizeAnswer.model_validate(answer_json()))]
+    client.localize(RGB, DEPTH, replace(CAMERA, distortion=distortion, distortion_model=model))
+    read = request_from(told.asked[0]).camera
+    assert (tuple(read.distortion), read.distortion_model) == (distortion, model)
+
+
+def test_a_lens_of_another_enum_value_is_refused() -> None:
+    message = pb.LocalizeRequest(camera=pb.Camera(width=64, height=48, fx=32, fy=32, cx=31.5, cy=23.5))
+    message.camera.distortion_model = 7  # type: ignore[assignment]  # a later client may know more lenses
+    with pytest.raises(
+        RequestError, match=r"camera.distortion_model: Input should be 'brown_conrady' or 'kannala_brandt'"
+    ):
+        request_from(message)
 
 
 @pytest.mark.parametrize(

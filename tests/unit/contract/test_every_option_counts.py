@@ -24,7 +24,8 @@ SERVICE = Path(__file__).parents[3] / "service"
 Json = dict[str, Any]
 T = {"position": {"x": 1, "y": 2, "z": 3}, "orientation": {"x": 0.1, "y": 0.2, "z": 0.3, "w": 0.9}}
 FRAME: Json = {
-    "camera": {"model": "PINHOLE", "width": 64, "height": 48, "fx": 32, "fy": 32, "cx": 31.5, "cy": 23.5, "distortion": [0, 0]},
+    "camera": {"model": "PINHOLE", "width": 64, "height": 48, "fx": 32, "fy": 32, "cx": 31.5, "cy": 23.5,
+               "distortion": [-0.1, 0.02, 0, 0], "distortion_model": "brown_conrady"},
     "depth": {"scale_m": 0.001, "kind": "z", "encoding": "auto", "max_range_m": 40, "baseline_m": 0.12},
     "gravity": {"x": 0.1, "y": 1, "z": 0.1},
 }  # fmt: skip
@@ -84,7 +85,13 @@ def test_the_documents_describe_every_request_field() -> None:
 
 def other(value: Any, path: tuple[Any, ...]) -> Any:
     """Return another valid value, or an invalid one if there is no other valid value."""
-    told = {"kind": "range", "encoding": "carla", "map": "west", "model": "OPENCV"}
+    told = {
+        "kind": "range",
+        "encoding": "carla",
+        "map": "west",
+        "model": "OPENCV",
+        "distortion_model": "kannala_brandt",
+    }
     if path[-1] in told:
         return told[path[-1]]
     if isinstance(value, bool):
@@ -143,11 +150,29 @@ def test_another_value_of_any_field_changes_the_query_or_is_refused(
     assert asked(with_other(document, path)) != as_it_is
 
 
-@pytest.mark.parametrize("changed", [{"model": "OPENCV"}, {"distortion": [0.1]}])
-def test_a_camera_that_is_not_rectified_is_refused_with_the_remedy(changed: Json) -> None:
+@pytest.mark.parametrize(
+    ("changed", "remedy"),
+    [
+        ({"model": "OPENCV"}, "send the lens as distortion_model and distortion, or rectify both images"),
+        ({"distortion": [0.1]}, "send 4, 5, 8, 12 or 14 of k1, k2, p1, p2, k3"),
+        ({"distortion": [0.1, 0, 5, 0]}, "p1 = 5 is no lens, because it exceeds 1; check the order"),
+        ({"distortion": [], "distortion_model": "kannala_brandt"}, "send 4 of k1, k2, k3, k4"),
+        ({"distortion": [0, 0, 0, 0, 0], "distortion_model": "kannala_brandt"}, "send 4 of k1, k2, k3, k4"),
+    ],
+)
+def test_a_lens_that_is_none_is_refused_with_the_remedy(changed: Json, remedy: str) -> None:
     refused = asked_alone(ALONE[0] | {"camera": FRAME["camera"] | changed})
     assert f"camera.{next(iter(changed))}" in refused
-    assert "rectify" in refused
+    assert remedy in refused
+
+
+def test_zeros_are_no_distortion_but_a_fisheye_lens() -> None:
+    camera = FRAME["camera"] | {"distortion": [0, 0, 0, 0]}
+    for changed in ({}, {"distortion": []}, {"distortion": [0.0] * 5}):
+        told = asked_alone(ALONE[0] | {"camera": camera | changed})["camera"]
+        assert (told["distortion"], told["distortion_model"]) == ([], "brown_conrady")
+    told = asked_alone(ALONE[0] | {"camera": camera | {"distortion_model": "kannala_brandt"}})["camera"]
+    assert (told["distortion"], told["distortion_model"]) == ([0.0] * 4, "kannala_brandt")
 
 
 def classes_of_options() -> Iterator[type]:

@@ -64,13 +64,45 @@ def test_every_camera_model_is_read(model, numbers, expected):
         ({"model": "PINHOLE", "modelParams": [300, 310, 320]}, RequestError),
         ({"model": "FISHEYE", "modelParams": [1] * 4}, RequestError),
         ({"model": None, "modelParams": None}, RequestError),
-        ({"model": "SIMPLE_RADIAL", "modelParams": [300, 320, 240, 0.1]}, NotYetSupportedError),
+        ({"model": "OPENCV_FISHEYE", "modelParams": [300, 310, 320, 240, 0.1]}, RequestError),
+        ({"model": "SIMPLE_RADIAL", "modelParams": [300, 320, 240, 2000]}, RequestError),
         ({"model": "PINHOLE", "modelParams": [-300, 310, 320, 240]}, RequestError),
     ],
 )
 def test_intrinsics_that_make_no_sense_are_refused(params, error):
     with pytest.raises(error):
         query_of(request_of([reading("RGBA32", RGB, params=params), reading("DEPTH", DEPTH)]), None)
+
+
+@pytest.mark.parametrize(
+    ("model", "numbers", "distortion", "lens"),
+    [
+        ("SIMPLE_RADIAL", [300, 320, 240, 0.1], (0.1, 0, 0, 0), "brown_conrady"),
+        ("RADIAL", [300, 320, 240, 0.1, 0.2], (0.1, 0.2, 0, 0), "brown_conrady"),
+        ("OPENCV", [300, 310, 320, 240, 0.1, 0.2, 0.01, 0.02], (0.1, 0.2, 0.01, 0.02), "brown_conrady"),
+        ("FULL_OPENCV", [300, 310, 320, 240, *[0.1] * 8], (0.1,) * 8, "brown_conrady"),
+        ("SIMPLE_RADIAL_FISHEYE", [300, 320, 240, 0.1], (0.1, 0, 0, 0), "kannala_brandt"),
+        ("RADIAL_FISHEYE", [300, 320, 240, 0.1, 0.2], (0.1, 0.2, 0, 0), "kannala_brandt"),
+        ("OPENCV_FISHEYE", [300, 310, 320, 240, 0, 0, 0, 0], (0, 0, 0, 0), "kannala_brandt"),
+    ],
+)
+def test_the_lens_of_colmaps_models_is_read(model, numbers, distortion, lens):
+    params = {"model": model, "modelParams": numbers}
+    depth = reading("DEPTH", DEPTH, params=params)
+    camera = query_of(request_of([reading("RGBA32", RGB, params=params), depth]), None).camera
+    assert (camera.distortion, camera.distortion_model) == (distortion, lens)
+    assert (camera.cx, camera.cy) == (319.5, 239.5)
+
+
+@pytest.mark.parametrize(
+    ("model", "numbers"),
+    [("PINHOLE", [300, 310, 320, 240]), ("OPENCV", [300, 310, 320, 240, 0.1, 0, 0, 0])],
+)
+def test_depth_of_another_lens_is_refused_not_misread(model, numbers):
+    bent = {"model": "OPENCV_FISHEYE", "modelParams": [300, 310, 320, 240, 0.1, 0, 0, 0]}
+    depth = reading("DEPTH", DEPTH, params={"model": model, "modelParams": numbers})
+    with pytest.raises(NotYetSupportedError, match=r"its distortion differs .*; send depth .* or rectify both images"):
+        query_of(request_of([reading("RGBA32", RGB, params=bent), depth]), None)
 
 
 def test_a_query_without_depth_is_refused_with_the_missing_part():

@@ -76,6 +76,38 @@ def test_focal_lengths_differ_by_a_fifth_at_most(fy, level):
     assert camera_file.check_focal_lengths(camera(fy=fy)).level == level
 
 
-@pytest.mark.parametrize(("distortion", "level"), [([], "ok"), ([0, 0, 0, 0], "ok"), ([-0.3, 0.1], "problem")])
-def test_distortion_means_that_images_must_be_rectified(distortion, level):
-    assert camera_file.check_distortion(camera(distortion=distortion)).level == level
+def test_images_without_distortion_must_be_rectified():
+    for distortion in ([], [0, 0, 0, 0]):
+        found = camera_file.check_distortion(camera(distortion=distortion))
+        assert (found.level, found.text) == ("ok", "none given: both images must be rectified")
+
+
+@pytest.mark.parametrize(
+    ("distortion", "model"), [([-0.3, 0.1, 0, 0], "brown_conrady"), ([0, 0, 0, 0], "kannala_brandt")]
+)
+def test_the_service_rectifies_a_lens_if_both_images_have_it(distortion, model):
+    found = camera_file.check_distortion(camera(distortion=distortion, distortion_model=model))
+    assert found.level == "ok"
+    assert found.text.startswith(f"{model} [")
+    assert found.text.endswith("the service rectifies both images")
+    assert "both images must have this lens" in found.remedy
+
+
+def test_a_lens_that_cannot_be_rectified_is_a_problem_with_the_remedy():
+    found = camera_file.check_distortion(camera(distortion=[-0.3, 0, 0, 0]))
+    assert found.level == "problem"
+    assert "not invertible over the image" in found.text
+    assert found.remedy.startswith("check the order of the coefficients")
+    assert camera_file.check_field_of_view(camera(distortion=[-0.3, 0, 0, 0])).level == "warning"
+
+
+def test_the_field_of_view_of_a_lens_is_that_of_the_rectified_image():
+    """An equidistant lens at 305.58 px for a radian: 120 and 90 degrees."""
+    fisheye = camera(fx=305.58, fy=305.58, distortion=[0, 0, 0, 0], distortion_model="kannala_brandt")
+    found = camera_file.check_field_of_view(fisheye)
+    assert (found.level, found.text) == (
+        "ok",
+        "120 degrees across and 90 degrees down in the rectified image of 729x421",
+    )
+    narrow = camera(fx=1400, fy=1400, distortion=[0, 0, 0, 0], distortion_model="kannala_brandt")
+    assert camera_file.check_field_of_view(narrow).level == "warning"

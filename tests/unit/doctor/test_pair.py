@@ -50,9 +50,24 @@ def test_a_good_pair_is_ok(encoded, depth_m):
     assert check_measured_share(pair).text == "100% of the pixels have a depth"
 
 
-def test_distortion_does_not_keep_the_images_from_being_checked(encoded):
-    camera = {"width": 64, "height": 48, "fx": 32, "fy": 32, "cx": 31.5, "cy": 23.5, "distortion": [0.1]}
-    assert check_images(encoded(camera=camera))[0].level == "ok"
+LENS = {"width": 64, "height": 48, "fx": 32, "fy": 32, "cx": 31.5, "cy": 23.5, "distortion": [-0.3, 0.1, 0, 0]}
+
+
+def test_a_wrong_distortion_does_not_keep_the_images_from_being_checked(encoded):
+    """This radius stops growing before the corners. The check of the distortion tells."""
+    query = encoded(camera=LENS | {"distortion": [-0.3, 0, 0, 0]})
+    assert check_images(query)[0].level == "ok"
+    assert not query.camera.is_distorted
+
+
+def test_images_of_a_lens_are_rectified_for_the_checks_of_the_ground(encoded):
+    pair = pair_of(encoded(camera=LENS))
+    assert pair.rgb.shape == (48, 64, 3)
+    flat = pair.rectified()
+    assert not flat.camera.is_distorted
+    assert flat.observed is not None
+    assert flat.depth_m.shape == (flat.camera.height, flat.camera.width)
+    assert pair_of(encoded()).rectified().camera == encoded().camera
 
 
 def test_a_damaged_image_is_a_problem_with_the_remedy_of_the_service(encoded):

@@ -20,6 +20,7 @@ from google.protobuf.message import Message
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from service.geometry.distortion import COEFFICIENTS, LIMITS
 from service.grpc.generated.streetfix.v1 import localization_pb2 as pb
 from service.grpc.reading import SERVICE
 from service.grpc.server import GrpcServer
@@ -279,6 +280,28 @@ def test_bounds_of_several_fields_at_once(client: httpx.Client, parts_of: Parts,
         max(camera["fx"], 0.02 * camera["width"]), 100 * camera["width"]
     )  # else the camera alone is refused
     camera["fy"] = min(max(camera["fy"], 0.02 * camera["height"]), 100 * camera["height"])
+    status, answer = one(client, parts_of, document, data.draw(st.sampled_from(list(depths(parts_of).values()))))
+    assert allowed(status), answer
+
+
+@given(st.data())
+@settings(max_examples=150, deadline=None, derandomize=True, database=None, suppress_health_check=list(HealthCheck))
+def test_any_lens_is_answered_with_finite_numbers_or_refused(
+    client: httpx.Client, parts_of: Parts, data: st.DataObject
+) -> None:
+    document = full_request(parts_of)
+    model = data.draw(st.sampled_from(list(COEFFICIENTS)))
+    count = data.draw(st.sampled_from(COEFFICIENTS[model]))
+    share = data.draw(st.sampled_from([1e-4, 1e-2, 1.0]))
+    document["camera"] |= {
+        "distortion_model": model,
+        "distortion": [share * data.draw(st.floats(-limit, limit)) for _, limit in LIMITS[model][:count]],
+        "fx": 64 * data.draw(st.floats(0.02, 3)),
+        "fy": 48 * data.draw(st.floats(0.02, 3)),
+        "cx": data.draw(st.floats(-64, 128)),
+        "cy": data.draw(st.floats(-48, 96)),
+    }
+    document["depth"]["kind"] = data.draw(st.sampled_from(["z", "range"]))
     status, answer = one(client, parts_of, document, data.draw(st.sampled_from(list(depths(parts_of).values()))))
     assert allowed(status), answer
 

@@ -279,15 +279,26 @@ def test_a_request_that_is_no_json_object_is_refused(client: httpx.Client, parts
 
 
 @pytest.mark.parametrize(
-    ("changed", "field"),
+    ("changed", "field", "text"),
     [
-        ({"camera": CAMERA | {"distortion": [0.1, 0, 0, 0]}}, "camera.distortion"),
+        ({"distortion": [0.1, 0]}, "camera.distortion", "does not have 2 coefficients"),
+        ({"distortion": [0, 0, 0, 0], "distortion_model": "omni"}, "camera.distortion_model", "'kannala_brandt'"),
+        ({"distortion": [0, 0, -2, 0]}, "camera.distortion", "p1 = -2 is no lens"),
+        ({"distortion": [-0.3, 0, 0, 0]}, "camera.distortion", "stops growing"),
+        ({"cx": -100, "distortion": [0] * 4, "distortion_model": "kannala_brandt"}, "camera", "would be empty"),
     ],
 )
-def test_unknown_fields_are_refused_and_not_ignored(
-    client: httpx.Client, parts_of: Parts, changed: dict[str, Any], field: str
+def test_a_lens_that_cannot_be_rectified_is_refused_with_the_field(
+    client: httpx.Client, parts_of: Parts, changed: dict[str, Any], field: str, text: str
 ) -> None:
-    require_problem(post(client, parts_of(**changed)), 422, "not-yet", field)
+    problem = require_problem(post(client, parts_of(camera=CAMERA | changed)), 422, "request", field)
+    assert text in problem["detail"]
+
+
+def test_a_disparity_of_distorted_images_is_refused(client: httpx.Client, parts_of: Parts) -> None:
+    camera = CAMERA | {"distortion": [-0.1, 0.02, 0, 0]}
+    depth = {"kind": "disparity", "scale_m": 1, "baseline_m": 0.1}
+    require_problem(post(client, parts_of(camera=camera, depth=depth)), 422, "request", "depth.kind")
 
 
 TRUE_PRIOR = {"position": {"x": 20, "y": 100, "std_m": 5}, "heading_deg": 90}

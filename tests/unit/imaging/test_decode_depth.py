@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 
 from service.errors import DecodeError, RequestError, StreetfixError, TooLargeError, UnsupportedFormatError
 from service.geometry.camera import PinholeCamera
+from service.geometry.distortion import rays_of
 from service.imaging.decode import ImageLimits, decode_depth, default_scale_m
 from service.imaging.raw16 import write_raw16
 
@@ -151,6 +152,42 @@ def test_range_through_a_distorted_lens_uses_the_undistorted_rays():
     data = npy(np.full((4, 6), 3.0, np.float32))
     at_corner = [decode_depth(data, camera=camera, kind="range")[0, 0] for camera in (straight, bent)]
     assert at_corner[1] < at_corner[0]  # barrel distortion: the true ray leans farther out
+
+
+# By hand: 100 px for a radian. A pixel 100 px from the centre is at 1 rad, so z is 10 m cos(1) = 5.403 m; at 157 px there is no z left.
+def test_range_through_a_fisheye_lens_uses_the_angles_of_the_pixels():
+    camera = PinholeCamera(401, 301, 100.0, 100.0, 200.0, 150.0, (0.0,) * 4, "kannala_brandt")
+    data = npy(np.full((301, 401), 10.0, np.float32))
+    depth = decode_depth(data, camera=camera, kind="range")
+    np.testing.assert_allclose(depth[150, [200, 300, 350, 100]], [10, 5.403, 0.7074, 5.403], atol=1e-3)
+    assert not depth[150, [0, 40, 360, 400]].any()
+    assert depth[0, 200] == pytest.approx(10 * np.cos(1.5), abs=1e-3)
+    stored_z = decode_depth(data, camera=camera, kind="z")
+    assert (stored_z == 10).all()
+
+
+# By hand: at x = 0.5 the point of the lens is 0.5 (1 - 0.2 * 0.25) = 0.475 focal lengths from the centre; the ray is sqrt(1.25) long.
+def test_range_through_a_barrel_lens_uses_the_rays_before_rectification():
+    camera = PinholeCamera(401, 301, 400.0, 400.0, 200.0, 150.0, (-0.2, 0.0, 0.0, 0.0))
+    depth = decode_depth(npy(np.full((301, 401), 10.0, np.float32)), camera=camera, kind="range")
+    assert depth[150, 390] == pytest.approx(10 / np.sqrt(1.25), rel=1e-4)
+    assert depth[150, 10] == pytest.approx(10 / np.sqrt(1.25), rel=1e-4)
+
+
+def test_range_through_a_lens_follows_the_size_of_the_image():
+    camera = PinholeCamera(160, 120, 100.0, 100.0, 79.5, 59.5, (-0.2, 0.05, 0.001, 0.0))
+    for by in (1, 2, 5):
+        own = camera.scaled_to(160 * by, 120 * by)
+        pixels = np.stack(np.meshgrid(np.arange(0.0, own.width, 7), np.arange(0.0, own.height, 7)), axis=-1)
+        depth = decode_depth(npy(np.full((own.height, own.width), 10.0, np.float32)), camera=camera, kind="range")
+        np.testing.assert_allclose(depth[::7, ::7], 10 * rays_of(own, pixels)[..., 2], rtol=1e-4)
+
+
+def test_a_disparity_through_a_lens_is_refused():
+    bent = PinholeCamera(6, 4, 5.0, 5.0, 2.5, 1.5, (-0.2, 0.0, 0.0, 0.0))
+    with pytest.raises(RequestError, match=r"disparity is measured between rectified images.*; send") as told:
+        decode_depth(npy(np.full((4, 6), 2.0, np.float32)), camera=bent, kind="disparity", baseline_m=0.4)
+    assert told.value.field == "depth.kind"
 
 
 def test_the_limit_is_on_the_range_where_range_is_stored():

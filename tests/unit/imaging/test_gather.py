@@ -16,7 +16,7 @@ from service.imaging.view_grid import ViewGrid
 GRID = ViewGrid(rows=5, columns=37)  # neither a whole block of cells nor a whole number of rows in one
 
 
-def plain(rgb, depth_m, camera, R, grid):
+def plain(rgb, depth_m, camera, R, grid, observed=None):
     """Compute ray by ray in float32, as the kernel does."""
     rays = _sub_rays(grid).transpose(2, 0, 1).astype(np.float64) @ R.T
     cells = len(rays)
@@ -24,6 +24,12 @@ def plain(rgb, depth_m, camera, R, grid):
     for cell in range(cells):
         found, colours = [], []
         for ray in rays[cell]:
+            own = camera.scaled_to(depth_m.shape[1], depth_m.shape[0])
+            if observed is not None and ray[2] > 1e-3:
+                u, v = np.rint(ray[0] / ray[2] * own.fx + own.cx), np.rint(ray[1] / ray[2] * own.fy + own.cy)
+                inside = 0 <= u < depth_m.shape[1] and 0 <= v < depth_m.shape[0]
+                if inside and not observed[int(v), int(u)]:
+                    continue
             for picture, kind in ((depth_m, "depth"), (rgb, "rgb")):
                 own = camera.scaled_to(picture.shape[1], picture.shape[0])
                 if ray[2] <= 1e-3:
@@ -53,8 +59,9 @@ def plain(rgb, depth_m, camera, R, grid):
     tilt=st.floats(-0.4, 0.4),
     own_size=st.booleans(),
     holes=st.floats(0, 1),
+    unseen=st.sampled_from([None, 0.0, 0.3, 1.0]),
 )
-def test_the_kernel_equals_numpy(seed, turn, tilt, own_size, holes):
+def test_the_kernel_equals_numpy(seed, turn, tilt, own_size, holes, unseen):
     rng = np.random.default_rng(seed)
     camera = PinholeCamera(64, 48, 31.7, 31.9, 31.3, 23.1)
     rgb = rng.integers(0, 256, (48, 64, 3), np.uint8)
@@ -62,7 +69,9 @@ def test_the_kernel_equals_numpy(seed, turn, tilt, own_size, holes):
     depth_m[rng.random(depth_m.shape) < holes] = 0
     pitch = np.array([[np.cos(tilt), 0, np.sin(tilt)], [0, 1, 0], [-np.sin(tilt), 0, np.cos(tilt)]])
     R = R_BODY_OPTICAL.T @ pitch @ rotation_z(turn)
-    found, expected = gather(rgb, depth_m, camera, R, GRID), plain(rgb, depth_m, camera, R, GRID)
+    observed = None if unseen is None else rng.random(depth_m.shape) >= unseen
+    found = gather(rgb, depth_m, camera, R, GRID, observed)
+    expected = plain(rgb, depth_m, camera, R, GRID, observed)
     # A ray that falls just between two pixels may go either way: one of a thousand, here none or one cell.
     for one, other in zip(found, expected, strict=True):
         assert np.mean(~np.isclose(one, other, rtol=1e-4, atol=1e-3)) <= 2 / found[2].size
@@ -89,8 +98,30 @@ def test_absurd_intrinsics_read_no_pixel_that_is_not_there(focal, centre):
     assert ranges.shape == seen.shape == (GRID.rows, GRID.columns)
 
 
+def test_a_cell_that_only_meets_unobserved_pixels_is_empty():
+    """The right half of the image is not observed. Columns run from left to right."""
+    camera = PinholeCamera(64, 48, 32.0, 32.0, 31.5, 23.5)
+    observed = np.repeat(np.arange(64)[None] < 32, 48, axis=0)
+    rgb, depth_m = np.full((48, 64, 3), 200, np.uint8), np.full((48, 64), 5, np.float32)
+    ranges, colour, seen = gather(rgb, depth_m, camera, R_BODY_OPTICAL.T, ViewGrid(rows=5, columns=36), observed)
+    assert seen[:, :17].all()
+    assert (colour[:, :17] == 200).all()
+    assert not seen[:, 19:].any()
+    assert not ranges[:, 19:].any()
+    assert not colour[:, 19:].any()
+
+
 def test_pictures_that_are_none_are_refused():
     camera = PinholeCamera(64, 48, 32.0, 32.0, 31.5, 23.5)
+    with pytest.raises((ValueError, TypeCheckError)):
+        gather(
+            np.zeros((48, 64, 3), np.uint8),
+            np.ones((48, 64), np.float32),
+            camera,
+            R_BODY_OPTICAL.T,
+            GRID,
+            np.ones((9, 9), bool),
+        )
     with pytest.raises((ValueError, TypeCheckError)):  # whichever looks first
         gather(np.zeros((48, 64), np.uint8), np.ones((48, 64), np.float32), camera, R_BODY_OPTICAL.T, GRID)
 

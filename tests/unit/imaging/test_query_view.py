@@ -177,3 +177,18 @@ def test_views_at_several_turns_are_those_at_each_of_them():
         # A ray that falls just between two pixels may go either way.
         assert np.mean(~np.isclose(planes[:5], alone[:5], rtol=1e-4, atol=1e-3)) < 0.002
         np.testing.assert_allclose(planes[5], alone[5], atol=0.2)
+
+
+def test_a_pixel_that_the_lens_did_not_see_is_neither_measured_nor_observed():
+    """The lens saw the left two thirds of the image. Beyond them, the images hold what must not count."""
+    observed = np.repeat(np.arange(CAMERA.width)[None] < 213, CAMERA.height, axis=0)
+    rgb, depth_m = grey(), wall_depth()
+    rgb[~observed] = 255
+    partial, whole = view_of(rgb, depth_m, observed=observed), view_of()
+    right = plane(partial, "observed").any(axis=0).argmin()  # first column without an observed cell
+    assert 18 < right < 26
+    for name in ("range_m", "height_m", "v1", "observed", "brightness"):
+        assert not plane(partial, name)[:, right:].any()
+    for name in ("range_m", "height_m", "observed"):
+        np.testing.assert_allclose(plane(partial, name)[:, : right - 1], plane(whole, name)[:, : right - 1], atol=0.05)
+    assert partial.measured_share < whole.measured_share

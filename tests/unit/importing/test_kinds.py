@@ -79,6 +79,33 @@ def test_a_camera_is_read_alone_or_out_of_a_request(tmp_path):
         assert read_camera(tmp_path / "camera.json") == PinholeCamera(8, 6, 9.0, 10.0, 3.5, 2.5, (0.1, 0.0, 0.0, 0.0))
 
 
+def test_a_fisheye_camera_is_read(tmp_path):
+    told = {"width": 8, "height": 6, "fx": 9, "fy": 10, "cx": 3.5, "cy": 2.5, "distortion": [0, 0, 0, 0]}
+    (tmp_path / "camera.json").write_text(json.dumps(told | {"distortion_model": "kannala_brandt"}))
+    assert read_camera(tmp_path / "camera.json").is_distorted
+
+
+@pytest.mark.parametrize(
+    ("lens", "why"),
+    [
+        (
+            {"distortion": [0.1]},
+            "distortion: the model brown_conrady does not have 1 coefficients; send 4, 5, 8, 12 or 14",
+        ),
+        (
+            {"distortion_model": "omni"},
+            "distortion_model: 'omni' is not valid; choose one of: brown_conrady, kannala_brandt",
+        ),
+        ({"distortion_model": "kannala_brandt"}, "does not have 0 coefficients; send 4 of k1"),
+    ],
+)
+def test_a_lens_that_is_none_is_refused_with_the_file(tmp_path, lens, why):
+    told = {"width": 8, "height": 6, "fx": 9, "fy": 10, "cx": 3.5, "cy": 2.5}
+    (tmp_path / "camera.json").write_text(json.dumps(told | lens))
+    with pytest.raises(DatasetError, match=rf"camera\.json: .*{why}"):
+        read_camera(tmp_path / "camera.json")
+
+
 @pytest.mark.parametrize(
     "text", ["{", "[]", "{}", '{"width": 8, "height": 6, "fx": 0, "fy": 1, "cx": 0, "cy": 0}', '{"width": "wide"}']
 )

@@ -7,6 +7,7 @@ import pytest
 
 from service.errors import RequestError, TooLargeError
 from service.imaging.picture_headers import ImageLimits, require_pixels
+from service.imaging.rectify import TABLES_BYTES
 from service.runtime import memory
 from service.runtime.admission import MIB
 from service.runtime.memory import budget_of, memory_limit
@@ -68,7 +69,7 @@ def test_the_memory_of_process_and_maps_is_subtracted(limited: Any) -> None:
     settings = Settings()
     plain = budget_of(settings, threads=2).limit
     assert (
-        plain == 2 * GIB * 5 // 8 - memory.PROCESS_BYTES - 2 * memory.THREAD_BYTES
+        plain == 2 * GIB * 5 // 8 - memory.PROCESS_BYTES - 2 * memory.THREAD_BYTES - TABLES_BYTES
     )  # an eighth is spare, a quarter is the maps'
     assert budget_of(settings, threads=6).limit == plain - 4 * memory.THREAD_BYTES
     limited(2 * GIB, anonymous=300 * MIB)
@@ -79,7 +80,7 @@ def test_workers_share_it(limited: Any) -> None:
     limited(8 * GIB)
     one = budget_of(Settings(workers=1), threads=2)
     four = budget_of(Settings(workers=4), threads=2)
-    fixed = memory.PROCESS_BYTES + 2 * memory.THREAD_BYTES
+    fixed = memory.PROCESS_BYTES + 2 * memory.THREAD_BYTES + TABLES_BYTES
     assert 4 * (four.limit + fixed) == pytest.approx(one.limit + fixed, abs=4)
     assert budget_of(Settings(workers=4, request_memory_mib=800), threads=2).limit == 200 * MIB
 

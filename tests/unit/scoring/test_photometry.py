@@ -9,7 +9,13 @@ from hypothesis import strategies as st
 from service.geometry.camera import PinholeCamera
 from service.geometry.rigid import R_BODY_OPTICAL, transform_from
 from service.registration.visibility import DiscSettings, SurfelRaycaster
-from service.scoring.photometry import PhotometrySettings, agreement_of_brightness, grey_of, squared_correlation
+from service.scoring.photometry import (
+    PhotometrySettings,
+    agreement_of_brightness,
+    grey_of,
+    seen_by_lens,
+    squared_correlation,
+)
 
 SETTINGS = PhotometrySettings(patch=2, flat=0.0)
 CAMERA = PinholeCamera(96, 72, 60.0, 60.0, 47.5, 35.5)
@@ -70,6 +76,16 @@ def test_the_small_image_covers_the_same_area_as_its_blocks():
     camera = PinholeCamera(4, 2, 4.0, 4.0, 1.5, 0.5)
     np.testing.assert_allclose(grey_of(rgb, camera, (8 / 9, 1.0), PATCHES), np.log(8.0), rtol=1e-6)
     assert grey_of(rgb, camera, (1.0, 1.0), PATCHES)[:, -1].min() > np.log(8.0)
+
+
+def test_a_small_pixel_is_seen_if_the_lens_saw_all_of_it():
+    """12 x 8 pixels, of which 10 x 8 make 5 x 4 blocks. The lens did not see the first column and one pixel."""
+    observed = np.ones((8, 12), np.bool_)
+    observed[:, 0] = observed[5, 7] = observed[:, 10:] = False
+    small = PinholeCamera(5, 4, 3.0, 3.0, 2.0, 1.5)
+    expected = np.ones((4, 5), np.bool_)
+    expected[:, 0] = expected[2, 3] = False
+    np.testing.assert_array_equal(seen_by_lens(observed, small, (10 / 12, 1.0)), expected)
 
 
 @pytest.fixture(scope="module")

@@ -98,6 +98,7 @@ export interface Camera {
   fy: number;
   cx: number;
   cy: number;
+  distortion_model?: string;
 }
 
 export interface Prior {

@@ -5,6 +5,8 @@ import type { Ink, Overlay, Point } from './overlay';
 import type { Palette } from './palette';
 
 const VIEW_M = 18;
+/** The service keeps so much of a fisheye image on each side (MOST_ASIDE_DEG in service/imaging/rectify.py), radians. */
+const MOST_ASIDE_RAD = Math.PI / 3;
 /** Two dimensions, 95 %: this many standard deviations. */
 const SIGMAS_95 = 2.4477;
 const SMALLEST_PX = 5;
@@ -75,8 +77,8 @@ export class AnswerLayer {
 
   #drawView(overlay: Overlay, pose: Pose, camera: Camera, colour: string, palette: Palette): void {
     const heading = (pose.heading_deg * Math.PI) / 180;
-    const left = Math.atan((camera.cx + 0.5) / camera.fx);
-    const right = Math.atan((camera.width - camera.cx - 0.5) / camera.fx);
+    const left = sideOf(camera, camera.cx + 0.5);
+    const right = sideOf(camera, camera.width - camera.cx - 0.5);
     const edge: Vector[] = [pose.position];
     for (let k = 0; k <= 16; k++) {
       const angle = heading + left - ((left + right) * k) / 16;
@@ -105,6 +107,13 @@ export class AnswerLayer {
     }
     overlay.path(edge, ink, true);
   }
+}
+
+/** Angle between the optical axis and a side of the image, radians. The radius of a fisheye image is nearly an angle. */
+function sideOf(camera: Camera, px: number): number {
+  const radius = px / camera.fx;
+  if (camera.distortion_model !== 'kannala_brandt') return Math.atan(radius);
+  return Math.max(-MOST_ASIDE_RAD, Math.min(MOST_ASIDE_RAD, radius));
 }
 
 export function colourOf(answer: Answer, palette: Palette): string {

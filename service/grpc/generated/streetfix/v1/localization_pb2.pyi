@@ -12,6 +12,12 @@ class CameraModel(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
     CAMERA_MODEL_UNSPECIFIED: _ClassVar[CameraModel]
     CAMERA_MODEL_PINHOLE: _ClassVar[CameraModel]
 
+class DistortionModel(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
+    __slots__ = ()
+    DISTORTION_MODEL_UNSPECIFIED: _ClassVar[DistortionModel]
+    DISTORTION_MODEL_BROWN_CONRADY: _ClassVar[DistortionModel]
+    DISTORTION_MODEL_KANNALA_BRANDT: _ClassVar[DistortionModel]
+
 class DepthKind(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
     __slots__ = ()
     DEPTH_KIND_UNSPECIFIED: _ClassVar[DepthKind]
@@ -52,6 +58,9 @@ class StreetSection(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
     STREET_SECTION_END: _ClassVar[StreetSection]
 CAMERA_MODEL_UNSPECIFIED: CameraModel
 CAMERA_MODEL_PINHOLE: CameraModel
+DISTORTION_MODEL_UNSPECIFIED: DistortionModel
+DISTORTION_MODEL_BROWN_CONRADY: DistortionModel
+DISTORTION_MODEL_KANNALA_BRANDT: DistortionModel
 DEPTH_KIND_UNSPECIFIED: DepthKind
 DEPTH_KIND_Z: DepthKind
 DEPTH_KIND_RANGE: DepthKind
@@ -287,7 +296,7 @@ class PriorWgs84(_message.Message):
     def __init__(self, latitude_deg: _Optional[float] = ..., longitude_deg: _Optional[float] = ..., std_m: _Optional[float] = ...) -> None: ...
 
 class Camera(_message.Message):
-    __slots__ = ("model", "width", "height", "fx", "fy", "cx", "cy", "distortion", "height_m", "height_std_m")
+    __slots__ = ("model", "width", "height", "fx", "fy", "cx", "cy", "distortion", "height_m", "height_std_m", "distortion_model")
     MODEL_FIELD_NUMBER: _ClassVar[int]
     WIDTH_FIELD_NUMBER: _ClassVar[int]
     HEIGHT_FIELD_NUMBER: _ClassVar[int]
@@ -298,6 +307,7 @@ class Camera(_message.Message):
     DISTORTION_FIELD_NUMBER: _ClassVar[int]
     HEIGHT_M_FIELD_NUMBER: _ClassVar[int]
     HEIGHT_STD_M_FIELD_NUMBER: _ClassVar[int]
+    DISTORTION_MODEL_FIELD_NUMBER: _ClassVar[int]
     model: CameraModel
     width: int
     height: int
@@ -308,7 +318,8 @@ class Camera(_message.Message):
     distortion: _containers.RepeatedScalarFieldContainer[float]
     height_m: float
     height_std_m: float
-    def __init__(self, model: _Optional[_Union[CameraModel, str]] = ..., width: _Optional[int] = ..., height: _Optional[int] = ..., fx: _Optional[float] = ..., fy: _Optional[float] = ..., cx: _Optional[float] = ..., cy: _Optional[float] = ..., distortion: _Optional[_Iterable[float]] = ..., height_m: _Optional[float] = ..., height_std_m: _Optional[float] = ...) -> None: ...
+    distortion_model: DistortionModel
+    def __init__(self, model: _Optional[_Union[CameraModel, str]] = ..., width: _Optional[int] = ..., height: _Optional[int] = ..., fx: _Optional[float] = ..., fy: _Optional[float] = ..., cx: _Optional[float] = ..., cy: _Optional[float] = ..., distortion: _Optional[_Iterable[float]] = ..., height_m: _Optional[float] = ..., height_std_m: _Optional[float] = ..., distortion_model: _Optional[_Union[DistortionModel, str]] = ...) -> None: ...
 
 class DepthFormat(_message.Message):
     __slots__ = ("scale_m", "kind", "encoding", "max_range_m", "baseline_m")
