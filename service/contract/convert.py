@@ -371,8 +371,9 @@ def camera_of(camera: schema.Camera) -> PinholeCamera:
         camera: of a request.
     """
     plain = PinholeCamera(camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy)
-    lens = replace(plain, distortion=tuple(camera.distortion), distortion_model=camera.distortion_model)
-    return lens if lens.is_distorted else plain
+    if camera.distortion_model == "brown_conrady" and not any(camera.distortion):
+        return plain
+    return replace(plain, distortion=tuple(camera.distortion), distortion_model=camera.distortion_model)
 
 
 def _prior(prior: schema.Prior) -> Prior:

@@ -154,7 +154,8 @@ class Camera(_Strict):
     @classmethod
     def _is_a_lens(cls, distortion: list[float], info: ValidationInfo) -> list[float]:
         model = info.data.get("distortion_model")  # None: refused itself
-        if model is not None and (problem := coefficient_problem(model, distortion)):
+        is_lens = model == "kannala_brandt" or any(distortion)
+        if model is not None and is_lens and (problem := coefficient_problem(model, distortion)):
             raise ValueError(problem)
         return distortion
 

@@ -71,7 +71,8 @@ def named(document: Json) -> set[tuple[str, ...]]:
 #: The height of the camera is said, or follows from the vehicle.
 HIGH = FRAME | {"camera": FRAME["camera"] | {"height_m": 0.3, "height_std_m": 0.02}}
 ON_GROUND = {"vehicle_base_on_ground": True}
-ALONE = [HIGH | ABOUT | {"prior": POSITION}, FRAME | ABOUT | ON_GROUND | {"prior": WGS84}]
+TRACK = {"track": {"belief": "AAAA", "T_previous_camera": T}}
+ALONE = [HIGH | ABOUT | TRACK | {"prior": POSITION}, FRAME | ABOUT | ON_GROUND | {"prior": WGS84}]
 SEQUENCES = [
     ABOUT | {"frames": [frame, frame | {"T_reference_camera": T}]} | more
     for frame, more in ((HIGH, {"prior": POSITION}), (FRAME, ON_GROUND | {"prior": WGS84}))
@@ -90,6 +91,7 @@ def other(value: Any, path: tuple[Any, ...]) -> Any:
         "encoding": "carla",
         "map": "west",
         "model": "OPENCV",
+        "belief": "BBBB",
         "distortion_model": "kannala_brandt",
     }
     if path[-1] in told:
