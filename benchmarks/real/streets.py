@@ -21,6 +21,7 @@ from model_training.evaluation.measures import recall_at
 from model_training.evaluation.odometry import as_query
 from model_training.evaluation.predict import RANKED, Predictions, predict
 from model_training.evaluation.stages import stages_of
+from model_training.evaluation.tracks import followed, steps_of
 from model_training.importing.kinds import OpenSettings, open_recording
 from model_training.importing.take import TakeSettings, take
 from model_training.mapping.build import build_map
@@ -70,6 +71,7 @@ def street_rows(report: Report, data: Path, work: Path, drives: tuple[str, ...] 
         answer_rows(report, f"real.{street.name}", found)
         _stage_rows(report, street)
         others.append(peer_rows(report, street.name, street.dataset, street.localizer, QUERIES))
+        track_rows(report, street.name, street.dataset, street.localizer)
         if street.name == "kitti_0013":
             sequence_rows(report, street.name, street.dataset, street.localizer)
     pooled_rows(report, others)
@@ -218,3 +220,19 @@ def sequence_rows(report: Report, name: str, dataset: Dataset, localizer: Locali
         localized.append(answer.status == "LOCALIZED")
     limits = (1.0 if bars else None, None, None)
     status_rows(report, f"real.sequence{SEQUENCE}.{name}", np.array(errors), np.array(localized, bool), bars=limits)
+
+
+def track_rows(report: Report, name: str, dataset: Dataset, localizer: Localizer) -> None:
+    """Add the rows of a robot that is followed over the whole drive, at default settings.
+
+    The odometry has the errors of ``model_training.evaluation.tracks``.
+
+    Args:
+        report: receives the rows.
+        name: name of the drive, part of the row ids.
+        dataset: the dataset of the drive.
+        localizer: localizer of its map.
+    """
+    found = followed(localizer, [steps_of(list(dataset.queries(QUERIES)), np.random.default_rng(0))])
+    errors, localized = found.error_m[0], found.accepted[0]
+    status_rows(report, f"real.track.{name}", errors, localized, bars=(None, None, None))
