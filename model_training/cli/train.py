@@ -19,8 +19,8 @@ def command(
     recipe: Annotated[
         str,
         typer.Option(
-            help="stock: many cities. matched: some of them, and cities with stereo-matched depth. paper: the paper's "
-            "city itself."
+            help="stock: many cities. matched: some of them, and cities with stereo-matched depth. rigs: as matched, and "
+            "cities that random rigs ask, from a small robot to a lorry. paper: the paper's city itself."
         ),
     ] = "stock",
     cities: Annotated[

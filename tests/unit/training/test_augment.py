@@ -14,6 +14,7 @@ COUNT = 300
 NOTHING = Augmentation(
     disparity_noise_px=(1e-6, 1e-6),
     scale_error=0,
+    monocular=0,
     invented_depth=0,
     short_range=0,
     no_colour=0,
@@ -226,3 +227,13 @@ def test_cells_outside_the_field_of_view_are_not_observed():
     for name in ("range_m", "observed", "brightness"):
         assert not plane(planes, name)[:, :, :40].any(), name
     assert plane(planes, "observed")[:, :, 40:].all()
+
+
+@pytest.mark.parametrize(("monocular", "largest"), [(0.0, 0.02), (1.0, 0.12)])
+def test_a_view_of_monocular_depth_has_the_larger_scale_error(monocular, largest):
+    """Each view has one scale, uniform between minus and plus the largest error. The median over holes and noise shows it."""
+    augment = augmenter(scale_error=0.02, monocular=monocular, monocular_scale_error=0.12)
+    ranges = plane(query(augment), "range_m")
+    scales = torch.stack([view[view > 0].median() / 15.0 - 1 for view in ranges])
+    assert scales.abs().max() == pytest.approx(largest, rel=0.1)
+    assert scales.std() == pytest.approx(largest / 3**0.5, rel=0.15)

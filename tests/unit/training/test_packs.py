@@ -1,4 +1,5 @@
 import itertools
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -15,14 +16,17 @@ from model_training.simulation.traversal import upright_on
 from model_training.training import packs as module
 from model_training.training.matched_views import MatchedRig
 from model_training.training.packs import OWN_DRIVES, Pack, PackPlan, make_pack, make_packs, rows_seen_by
+from model_training.training.random_rigs import FIELD_OF_VIEW_DEG, FOCAL_BASELINE_PX_M, HEIGHT_M, random_rigs
 from model_training.training.recipe import (
     CALIBRATION_SEEDS,
     EVALUATION_SEEDS,
     RECIPES,
+    STOCK_CITIES,
     TRAINING_SEEDS,
     WATCH_SEEDS,
     matched_plans,
     paper_plans,
+    rig_plans,
     stock_plans,
     watch_plans,
 )
@@ -133,6 +137,42 @@ def test_cities_of_matched_pairs_are_none_of_the_stock_recipes():
     assert matched <= set(TRAINING_SEEDS)
     assert not matched & {plan.seed for plan in stock_plans(40)}
     assert all(plan.rigs for plan in RECIPES["matched"](1)[-5:])
+
+
+def test_cities_of_random_rigs_are_cities_of_their_own():
+    others = {plan.seed for plan in [*stock_plans(STOCK_CITIES), *matched_plans(20)]}
+    plans = rig_plans()
+    assert {plan.seed for plan in plans} <= set(TRAINING_SEEDS)
+    assert not {plan.seed for plan in plans} & others
+    assert len({plan.seed for plan in plans}) == len(plans)
+    assert set(rig_plans()) <= set(RECIPES["rigs"](1))
+    assert {bool(plan.rigs) for plan in plans} == {True, False}
+    assert all(plan.camera_height_m == HEIGHT_M for plan in plans)
+
+
+def test_random_rigs_cover_the_range_and_no_two_are_the_same():
+    rigs = random_rigs(5, 200)
+    assert rigs == random_rigs(5, 200)
+    assert len(set(rigs)) == 200
+    heights = [math.sqrt(rig.height_m[0] * rig.height_m[1]) for rig in rigs]
+    assert HEIGHT_M[0] * 0.99 < min(heights) < 0.4
+    assert 2.5 < max(heights) < HEIGHT_M[1] * 1.01
+    baselines = [rig.model.focal_baseline_px_m for rig in rigs]
+    assert FOCAL_BASELINE_PX_M[0] <= min(baselines) < 30
+    assert 170 < max(baselines) <= FOCAL_BASELINE_PX_M[1]
+    fields = [2 * math.degrees(math.atan(rig.camera.width / 2 / rig.camera.fx)) for rig in rigs]
+    assert FIELD_OF_VIEW_DEG[0] <= min(fields) < max(fields) <= FIELD_OF_VIEW_DEG[1]
+    assert {rig.model.matching for rig in rigs} == {stereo.matching for stereo in STEREOS.values()}
+    assert [rig.condition for rig in rigs[:4]] == ["hard_light", "clear", "hard_light", "clear"]
+
+
+def test_the_height_of_the_survey_and_of_clean_queries_follows_the_plan(tmp_path):
+    plan = replace(PLAN, lidar_height_m=1.2, camera_height_m=(0.4, 0.5))
+    make_pack(plan, tmp_path / plan.stem, ViewGrid())
+    pack = Pack.open(tmp_path / plan.stem)
+    assert plan.stem != PLAN.stem
+    assert np.median(pack.places[:, 3]) == pytest.approx(1.2, abs=0.2)
+    assert ((pack.queries[:, 3] >= 0.4) & (pack.queries[:, 3] <= 0.5)).all()
 
 
 RIG = MatchedRig(
