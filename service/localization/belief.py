@@ -31,8 +31,9 @@ ALTERNATIVES = 2.0
 MISSED = 0.02
 #: Least probability of a frame that the camera is in the map, and that it is outside. No single frame is surer.
 LEAST_PROBABILITY = 1e-4
-#: A candidate agrees with a mode within this distance and angle. Three standard deviations of the mode are added to the distance.
-AGREES_M, AGREES_RAD = 1.0, float(np.deg2rad(15.0))
+#: A candidate agrees with a mode within this distance and angle. Three standard deviations of the mode are added to the distance, up to a
+#: limit: after a long way without images, a mode covers many places, and a candidate in it confirms nothing.
+AGREES_M, AGREES_RAD, MOST_AGREES_M = 1.0, float(np.deg2rad(15.0)), 10.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -242,7 +243,7 @@ def agrees(mode: Mode, T_map_camera: Transform) -> bool:
     away_m = float(np.hypot(*(T_map_camera[:2, 3] - mode.T_map_camera[:2, 3])))
     turned = heading_of_camera(T_map_camera) - heading_of_camera(mode.T_map_camera)
     deviation_m = float(np.sqrt(np.linalg.eigvalsh(mode.covariance[:2, :2])[-1]))
-    return away_m <= AGREES_M + 3.0 * deviation_m and bool(np.cos(turned) >= np.cos(AGREES_RAD))
+    return away_m <= min(AGREES_M + 3.0 * deviation_m, MOST_AGREES_M) and bool(np.cos(turned) >= np.cos(AGREES_RAD))
 
 
 def _pairs(modes: Sequence[Mode], candidates: Sequence[Seen]) -> dict[int, int]:
