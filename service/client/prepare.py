@@ -283,7 +283,19 @@ def _track(track: Track | None) -> dict[str, Any]:
     """Return the field of a track; none without a track, because an earlier service does not know it."""
     if track is None:
         return {}
+    if not isinstance(track, Track):
+        raise RequestError("track: it is no Track; pass Track(before=answer, T_previous_camera=...)", field="track")
+    if track.before is None and track.T_previous_camera is not None:
+        raise RequestError(
+            "track.before: it is missing, but T_previous_camera is given; pass the previous answer as before, or Track() to begin",
+            field="track.before",
+        )
     belief = None if track.before is None else track.before.belief
+    if track.before is not None and belief is None and track.before.confidence is not None:
+        raise RequestError(
+            "track.before: this answer has no belief, because its request had no track; begin with track=Track()",
+            field="track.before",
+        )
     T = _transform(track.T_previous_camera, "track.T_previous_camera")
     return {"track": {"belief": None if belief is None else belief.token, "T_previous_camera": T}}
 

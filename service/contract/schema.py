@@ -564,7 +564,8 @@ class AcceptanceThreshold(BaseModel):
         gt=0,
         lt=1,
         description="upper bound (95 %, Clopper and Pearson) of the share of out-of-map queries that reach this confidence, "
-        "from the calibration data. It may be lower than the requested rate: calibration measured some rates only",
+        "from the calibration data. It may be lower than the requested rate: calibration measured some rates only. It holds for a "
+        "query without a track",
     )
 
 
@@ -586,8 +587,9 @@ class Belief(BaseModel):
 
     epoch: int = Field(
         ge=0,
-        description="number of disruptions so far. It rises when a LOCALIZED answer does not continue the last one by odometry, or "
-        "when the track began again. Then the transform from odometry to the map jumps",
+        description="number of disruptions so far. It rises when a LOCALIZED answer does not continue the last one by odometry: "
+        "after a displacement, a wrong answer, or a long way without images. It also rises when a track with a pose begins again. "
+        "Then the transform from odometry to the map jumps",
     )
     modes: list[Mode] = Field(description="the most probable first, at most 8. None of them is confirmed")
     elsewhere: float = Field(ge=0, le=1, description="probability of all other places of the map")

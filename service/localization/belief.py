@@ -20,13 +20,16 @@ from service.geometry.uncertainty import covariance_at
 MOST_MODES = 8
 #: Modes with less weight return to the rest of the map.
 LEAST_WEIGHT = 1e-4
-#: Probability that somebody carries the robot to another place, per frame.
-KIDNAPPED = 0.01
-#: Standard deviation of odometry: share of the distance, metres at least, share of the angle, and radians at least.
+#: Probability that the odometry misses a displacement: for each frame, and in addition for a motion of ``NEW_M`` or ``NEW_RAD``.
+KIDNAPPED, KIDNAPPED_ON_THE_WAY = 0.0005, 0.01
+#: Standard deviation of odometry: share of the distance, plus metres; share of the angle, plus radians. A robot that stands still has none.
 ODOMETRY_STD = (0.03, 0.02, 0.03, float(np.deg2rad(0.2)))
 #: Number of places that wrong candidates of consecutive frames are spread over. Errors repeat, because a perceptual alias moves along
 #: with the robot. So it is far below the number of places of the map.
 ALTERNATIVES = 2.0
+#: Motion after which a frame is new evidence for a mode that the last frames agreed with: metres, or radians. A robot that stands still
+#: sees one picture again and again, with the same error.
+NEW_M, NEW_RAD = 2.0, float(np.deg2rad(20.0))
 #: Least probability, as a share of being in the map, that no candidate of a frame is right.
 MISSED = 0.02
 #: Least probability of a frame that the camera is in the map, and that it is outside. No single frame is surer.
@@ -82,6 +85,7 @@ class Mode:
         inliers: inlier share of the last frame that agreed.
         similarity: similarity of the last frame that agreed.
         unseen: number of frames since one agreed.
+        news: how new a frame is for this mode: motion since one agreed, relative to ``NEW_M`` and ``NEW_RAD``, 0 to 1.
     """
 
     T_map_camera: Transform
@@ -91,6 +95,7 @@ class Mode:
     inliers: float
     similarity: float
     unseen: int = 0
+    news: float = 0.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -109,13 +114,16 @@ class Belief:
     outside: float = 0.5
     born: int = 0
 
-    def moved(self, T_previous_camera: Transform, *, kidnapped: float = KIDNAPPED) -> "Belief":
+    def moved(self, T_previous_camera: Transform, *, kidnapped: float | None = None) -> "Belief":
         """Return the belief after a motion.
 
         Args:
             T_previous_camera: odometry, from this camera's frame to the previous camera's frame, metres.
             kidnapped: probability that the odometry missed a displacement. Then the robot is in the map or outside, equally likely.
+                None: it follows from the size of the motion.
         """
+        if kidnapped is None:
+            kidnapped = KIDNAPPED + KIDNAPPED_ON_THE_WAY * _news_of(T_previous_camera)
         stays = 1.0 - kidnapped
         modes = tuple(replace(moved(mode, T_previous_camera), weight=stays * mode.weight) for mode in self.modes)
         elsewhere, outside = (stays * each + kidnapped / 2 for each in (self.elsewhere, self.outside))
@@ -129,23 +137,32 @@ class Belief:
             alternatives: number of places that wrong candidates of consecutive frames are spread over.
         """
         partner = _pairs(self.modes, sighting.candidates)
+        first = next((self.modes[k] for k, j in partner.items() if j == 0), None)
+        news = (
+            1.0 if first is None else first.news
+        )  # a frame that finds another place than before shows another picture
+        new = sum(each.probability for j, each in enumerate(sighting.candidates) if j not in partner.values())
+        rest, outside = sighting.elsewhere**news, sighting.outside**news
         modes, born = [], self.born
         for k, mode in enumerate(self.modes):
             found = sighting.candidates[partner[k]] if k in partner else None
             if found is None or alternatives * found.probability < sighting.elsewhere:
-                modes.append(replace(mode, weight=mode.weight * sighting.elsewhere, unseen=mode.unseen + 1))
+                modes.append(replace(mode, weight=mode.weight * rest, unseen=mode.unseen + 1))
                 continue
             modes.append(
                 replace(
                     mode,
                     T_map_camera=found.T_map_camera,
                     covariance=found.covariance,
-                    weight=mode.weight * alternatives * found.probability,
+                    weight=mode.weight * (alternatives * found.probability) ** news,
                     inliers=found.inliers,
                     similarity=found.similarity,
                     unseen=0,
+                    news=0.0,
                 )
             )
+        elsewhere = self.elsewhere * (sighting.elsewhere + new) ** news
+        taken = news / (sighting.elsewhere + new)  # share of it, per probability, that goes to new modes
         for j, found in enumerate(sighting.candidates):
             if j in partner.values():
                 continue
@@ -153,14 +170,14 @@ class Belief:
                 Mode(
                     found.T_map_camera,
                     found.covariance,
-                    self.elsewhere * found.probability,
+                    elsewhere * taken * found.probability,
                     born,
                     found.inliers,
                     found.similarity,
                 )
             )
             born += 1
-        return _normalised(modes, self.elsewhere * sighting.elsewhere, self.outside * sighting.outside, born)
+        return _normalised(modes, elsewhere * (1.0 - taken * new), self.outside * outside, born)
 
     def raised(self, seen: Seen) -> "Belief":
         """Return the belief after an answer of several frames together: its pose has at least the probability of the answer.
@@ -202,9 +219,8 @@ def sighting_of(
     known = min(max(known, LEAST_PROBABILITY), 1.0 - LEAST_PROBABILITY)
     if not candidates:
         return Sighting((), known, 1.0 - known)
-    first = min(confidence, known) if shares[0] > 0.5 else min(confidence, float(shares[0]) * known)
     most = (1.0 - MISSED) * known
-    first = min(first, most)
+    first = min(confidence, most if shares[0] > 0.5 else float(shares[0]) * most)
     total = min(most, max(first, confidence / float(shares[0])))
     rest = float(shares[1:].sum())
     each = np.array([first, *((total - first) * shares[1:] / rest if rest > 0 else shares[1:] * 0.0)])
@@ -215,9 +231,9 @@ def sighting_of(
 def _motion_covariance(T_previous_camera: Transform) -> Float64[NDArray[np.float64], "6 6"]:
     """Return the covariance of an odometry step: equal in all directions."""
     share, least_m, angle_share, least_rad = ODOMETRY_STD
-    distance_m = float(np.linalg.norm(T_previous_camera[:3, 3]))
-    angle = float(np.arccos(np.clip((np.trace(T_previous_camera[:3, :3]) - 1) / 2, -1, 1)))
-    position, rotation = least_m + share * distance_m, least_rad + angle_share * angle
+    distance_m, angle = size_of(T_previous_camera)
+    moving = min(1.0, distance_m / least_m + angle / least_rad)
+    position, rotation = moving * least_m + share * distance_m, moving * least_rad + angle_share * angle
     return np.diag([position**2] * 3 + [rotation**2] * 3)
 
 
@@ -230,7 +246,24 @@ def moved(mode: Mode, T_previous_camera: Transform) -> Mode:
     """
     T = nearest_rigid(mode.T_map_camera @ T_previous_camera)
     carried = covariance_at(mode.covariance, mode.T_map_camera[:3, 3], T[:3, 3])
-    return replace(mode, T_map_camera=T, covariance=carried + _motion_covariance(T_previous_camera))
+    news = min(1.0, mode.news + _news_of(T_previous_camera))
+    return replace(mode, T_map_camera=T, covariance=carried + _motion_covariance(T_previous_camera), news=news)
+
+
+def _news_of(T_previous_camera: Transform) -> float:
+    """Return how new the picture after a motion is, 0 to 1."""
+    way_m, angle = size_of(T_previous_camera)
+    return min(1.0, way_m / NEW_M + angle / NEW_RAD)
+
+
+def size_of(T: Transform) -> tuple[float, float]:
+    """Return length (m) and angle (rad) of a motion.
+
+    Args:
+        T: the motion (4, 4).
+    """
+    angle = float(np.arccos(np.clip((np.trace(T[:3, :3]) - 1) / 2, -1, 1)))
+    return float(np.linalg.norm(T[:3, 3])), angle
 
 
 def agrees(mode: Mode, T_map_camera: Transform) -> bool:

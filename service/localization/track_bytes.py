@@ -15,8 +15,8 @@ from service.localization.tracker import Track
 
 #: Format, map version, epoch, modes so far, probability of other places, of the outside; number of modes, of last answers (0 or 1).
 _HEAD = struct.Struct("<4s8sIIddBB")
-#: Position (m), quaternion, upper triangle of the covariance, weight, number, inliers, similarity, frames since one agreed.
-_MODE = struct.Struct("<3d4f21fdI2fH")
+#: Position (m), quaternion, upper triangle of the covariance, weight, number, inliers, similarity, news, frames since one agreed.
+_MODE = struct.Struct("<3d4f21fdI3fH")
 _FORMAT, _UPPER = b"SFB1", np.triu_indices(6)
 MOST_BYTES = _HEAD.size + (MOST_MODES + 1) * _MODE.size
 _MOST_UNSEEN, _MOST_COUNT = 2**16 - 1, 2**32 - 1
@@ -58,7 +58,7 @@ def _packed_mode(mode: Mode) -> bytes:
     T = mode.T_map_camera
     return _MODE.pack(
         *T[:3, 3], *quaternion_xyzw_from(T[:3, :3]), *mode.covariance[_UPPER], mode.weight, mode.number, mode.inliers,
-        mode.similarity, min(mode.unseen, _MOST_UNSEEN),
+        mode.similarity, mode.news, min(mode.unseen, _MOST_UNSEEN),
     )  # fmt: skip
 
 
@@ -68,5 +68,5 @@ def _mode(content: bytes, at: int) -> Mode:
     covariance = np.zeros((6, 6))
     covariance[_UPPER] = numbers[7:28]
     covariance = np.triu(covariance) + np.triu(covariance, 1).T
-    weight, number, inliers, similarity, unseen = numbers[28:]
-    return Mode(T, covariance, weight, number, inliers, similarity, unseen)
+    weight, number, inliers, similarity, news, unseen = numbers[28:]
+    return Mode(T, covariance, weight, number, inliers, similarity, unseen, news)

@@ -7,11 +7,11 @@ import numpy as np
 from jaxtyping import Float64
 from numpy.typing import NDArray
 
-from service.confidence.decision import Decision
+from service.confidence.decision import Decision, decision_of
 from service.confidence.extrapolation import extrapolated
 from service.geometry.rigid import Transform, inverse, nearest_rigid
-from service.localization.answer import Answer
-from service.localization.belief import Belief, Mode, Seen, agrees, moved, sighting_of
+from service.localization.answer import Answer, require_finite
+from service.localization.belief import Belief, Mode, Seen, agrees, moved, sighting_of, size_of
 from service.localization.localizer import Found, Localizer
 from service.option_limits import FALSE_ACCEPT_RATE
 from service.retrieval.frame import Frame
@@ -20,8 +20,12 @@ from service.timing import StageTimer
 
 #: Maximum number of frames that are registered together. Five frames resolve a street of repeating blocks (decision log).
 MOST_FRAMES = 5
+#: Frames are registered together if they are at least so far apart, metres or radians. Nearer ones show one picture twice.
+APART_M, APART_RAD = 0.5, float(np.deg2rad(10.0))
 #: An answer is not accepted if its rivals leave it this probability or less.
 CONTRADICTED = 0.5
+#: An answer of the belief needs more than this probability, whatever the false-accept rate: more than all rivals together.
+MAJORITY = 0.5
 #: Number of modes whose predicted poses are starts of the registration.
 PREDICTED = 4
 
@@ -83,23 +87,41 @@ def follow(
         belief = track.belief.moved(T_previous_camera)
         last = None if track.last is None else moved(track.last, T_previous_camera)
     if not localizer.decides(frame.query):  # there is no probability to believe
-        frames = (frame, *kept)
-        return localizer.answer(frames, timer), Track(frames=frames[: MOST_FRAMES - 1], epoch=track.epoch)
+        frames = (frame, *_apart(kept))
+        following = Track(belief.unseen(), track.epoch, last, _window(frame, kept))
+        return localizer.answer(frames, timer), following
     predicted = tuple(mode.T_map_camera for mode in belief.modes[:PREDICTED])
     alone = localizer.register((frame,), timer, predicted)
     with timer.stage("register"):
         belief = _believed(localizer, frame, alone, belief)
     if _is_overtaken(last, belief):
         kept = ()
-    answer = _answer(localizer, (frame, *kept), alone, belief, timer)
+    answer = _answer(localizer, (frame, *_apart(kept)), alone, belief, timer)
     epoch = track.epoch
     if answer.status == "LOCALIZED" and answer.candidates and answer.covariance is not None:
         found = _seen(answer.candidates[0], answer.covariance, probability=answer.confidence or 0.0)
         epoch += int(last is not None and not agrees(last, found.T_map_camera))
         belief = belief.raised(found)
         last = Mode(found.T_map_camera, found.covariance, found.probability, 0, found.inliers, found.similarity)
-    following = Track(belief, epoch, last, (frame, *kept)[: MOST_FRAMES - 1])
-    return replace(answer, belief=belief, epoch=epoch), following
+    answer = replace(answer, belief=belief, epoch=epoch)
+    require_finite(answer)
+    return answer, Track(belief, epoch, last, _window(frame, kept))
+
+
+def _window(frame: Frame, kept: tuple[Frame, ...]) -> tuple[Frame, ...]:
+    """Return the frames to keep for the next one. A frame near the last kept one shows the same picture, so it is not kept."""
+    is_new = not kept or _is_apart(kept[0])
+    return ((frame, *kept) if is_new else kept)[: MOST_FRAMES - 1]
+
+
+def _apart(kept: tuple[Frame, ...]) -> tuple[Frame, ...]:
+    """Return the kept frames that show another picture than the newest frame."""
+    return tuple(each for each in kept if _is_apart(each))
+
+
+def _is_apart(kept: Frame) -> bool:
+    way_m, angle = size_of(kept.T_reference_camera)
+    return way_m / APART_M + angle / APART_RAD >= 1.0
 
 
 def _is_overtaken(last: Mode | None, belief: Belief) -> bool:
@@ -117,6 +139,10 @@ def _believed(localizer: Localizer, frame: Frame, alone: Found, belief: Belief) 
         return belief.unseen()
     if frame.query.false_accept_rate <= FALSE_ACCEPT_RATE and extrapolated(calibration, alone.evidence):
         return belief.unseen()
+    if belief.born and frame.query.prior is not None:  # a prior counts once, in the first frame of a track
+        decision = decision_of(calibration, replace(frame.query, prior=None), alone.refined, alone.evidence)
+        if decision is None:
+            return belief.unseen()
     candidates = distinct_candidates(alone.refined.with_covariances())
     seen = [_seen(each, each.covariance) for each in candidates if each.covariance is not None]
     return belief.seen(sighting_of(seen, shares_of(candidates, 1), decision.confidence, decision.known))
@@ -140,7 +166,7 @@ def _answer(localizer: Localizer, frames: tuple[Frame, ...], alone: Found, belie
     calibration, mode = localizer.bundle.calibration, belief.modes[0] if belief.modes else None
     if calibration is not None and alone.refined is not None and mode is not None and mode.unseen == 0:
         accepted = Decision("LOCALIZED", mode.weight, 1.0 - belief.outside)
-        if mode.weight >= calibration.threshold(frames[0].query.false_accept_rate):
+        if mode.weight > MAJORITY and mode.weight >= calibration.threshold(frames[0].query.false_accept_rate):
             refined = alone.refined.led_by(mode.T_map_camera)
             return localizer.compose(frames[:1], replace(alone, refined=refined, decision=accepted), timer)
     if found.decision is not None and found.decision.status == "LOCALIZED":

@@ -17,7 +17,7 @@ class Seal:
     """
 
     def __init__(self, key: str | None = None) -> None:
-        self._key = (key or secrets.token_hex(LEAST_KEY)).encode()
+        self._key = (key or secrets.token_hex(LEAST_KEY)).encode("utf-8", "surrogateescape")
 
     def sealed(self, content: bytes) -> bytes:
         """Return the bytes behind their code.

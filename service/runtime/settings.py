@@ -177,6 +177,11 @@ class Settings(BaseSettings):
             )
         return self
 
+    @field_validator("belief_key", mode="before")
+    @classmethod
+    def _none_if_empty(cls, value: object) -> object:
+        return value or None
+
     @field_validator("maps", mode="before")
     @classmethod
     def _split(cls, value: object) -> object:
@@ -245,6 +250,8 @@ def load_settings(config: Path | None = None, **flags: object) -> Settings:
         where = ".".join(str(part) for part in first["loc"])
         if first["type"] == "extra_forbidden":
             what = f"setting {where}: there is no such setting{did_you_mean(where, setting_names(Settings))}; docs/serving.md lists them"
+        elif where == "belief_key":  # a message must not show a secret
+            what = f"setting belief_key: the value is not valid; give {LEAST_KEY} random characters or more, or leave it out"
         elif where:
             what = f"setting {where}: {first['msg']} (it is {first['input']!r})"
         else:

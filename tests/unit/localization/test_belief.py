@@ -13,6 +13,8 @@ from service.localization.belief import (
     LEAST_WEIGHT,
     MISSED,
     MOST_MODES,
+    NEW_M,
+    NEW_RAD,
     ODOMETRY_STD,
     Belief,
     Mode,
@@ -25,6 +27,10 @@ from service.localization.belief import (
 SMALL = np.diag([0.01**2] * 6)
 #: A camera that looks along map x: its z axis is map x, its x axis is map -y.
 LEVEL = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
+
+
+#: 2 m straight ahead: a whole new picture.
+AHEAD = transform_from(np.eye(3), np.array([0.0, 0.0, NEW_M]))
 
 
 def pose(x: float, y: float = 0.0) -> np.ndarray:
@@ -48,12 +54,38 @@ def test_the_first_frame_gives_the_belief_its_own_probabilities():
 
 
 def test_a_second_frame_that_agrees_raises_the_probability():
-    """0.5 x 2 x 0.5 = 0.5 against 0.25 x 0.25 twice: 0.8. The repeated candidate adds nothing new."""
-    frame = Sighting((seen(0.0, 0.5),), elsewhere=0.25, outside=0.25)
-    belief = Belief().seen(frame).seen(frame)
+    """After 2 m: 0.5 x 2 x 0.5 = 0.5 against 0.25 x 0.25 twice, which is 0.8."""
+    belief = Belief().seen(Sighting((seen(0.0, 0.5),), elsewhere=0.25, outside=0.25))
+    belief = belief.moved(AHEAD, kidnapped=0.0).seen(Sighting((seen(2.0, 0.5),), elsewhere=0.25, outside=0.25))
     right, rest = 0.5 * ALTERNATIVES * 0.5, 0.25 * 0.25
     assert belief.modes[0].weight == pytest.approx(right / (right + 2 * rest))
-    assert belief.modes[0].unseen == 0
+    assert (belief.modes[0].unseen, belief.modes[0].news) == (0, 0.0)
+
+
+def test_a_robot_that_stands_still_learns_nothing_from_the_same_picture():
+    frame = Sighting((seen(0.0, 0.5),), elsewhere=0.25, outside=0.25)
+    belief = Belief().seen(frame)
+    for _ in range(20):
+        belief = belief.moved(np.eye(4), kidnapped=0.0).seen(frame)
+    assert belief.modes[0].weight == pytest.approx(0.5)
+    assert belief.modes[0].covariance[0, 0] == pytest.approx(0.01**2)
+
+
+def test_many_small_steps_count_as_one_long_step():
+    """20 steps of 0.1 m have the weight of one step of 2 m: the same odds of the mode against the outside."""
+    step = transform_from(np.eye(3), np.array([0.0, 0.0, 0.1]))
+    slow = Belief().seen(Sighting((seen(0.0, 0.5),), 0.25, 0.25))
+    for k in range(1, 21):
+        slow = slow.moved(step, kidnapped=0.0).seen(Sighting((seen(0.1 * k, 0.5),), 0.25, 0.25))
+    fast = Belief().seen(Sighting((seen(0.0, 0.5),), 0.25, 0.25)).moved(AHEAD, kidnapped=0.0)
+    fast = fast.seen(Sighting((seen(2.0, 0.5),), 0.25, 0.25))
+    assert slow.modes[0].weight / slow.outside == pytest.approx(fast.modes[0].weight / fast.outside)
+
+
+def test_a_turn_shows_another_picture_too():
+    belief = Belief().seen(Sighting((seen(0.0, 0.5),), 0.25, 0.25))
+    turned = belief.moved(transform_from(rotation_y(NEW_RAD / 2), np.zeros(3)))
+    assert turned.modes[0].news == pytest.approx(0.5)
 
 
 def test_a_frame_that_finds_another_place_lowers_the_mode():
@@ -72,8 +104,9 @@ def test_a_candidate_that_is_unlikelier_than_all_other_places_confirms_nothing()
 
 
 def test_equal_look_alikes_stay_equal():
-    two = Sighting((seen(0.0, 0.4), seen(50.0, 0.4)), 0.1, 0.1)
-    belief = Belief().seen(two).seen(two).seen(two)
+    belief = Belief()
+    for x in (0.0, 2.0, 4.0):
+        belief = belief.moved(AHEAD).seen(Sighting((seen(x, 0.4), seen(50.0 + x, 0.4)), 0.1, 0.1))
     assert belief.modes[0].weight == pytest.approx(belief.modes[1].weight)
     assert belief.modes[0].weight < 0.5
 
@@ -81,8 +114,7 @@ def test_equal_look_alikes_stay_equal():
 def test_a_motion_moves_the_modes_and_widens_them():
     """2 m ahead: the odometry adds 0.02 + 0.03 x 2 = 0.08 m. The rotation of 0.01 rad adds 0.02 m across, and nothing along."""
     belief = Belief().seen(Sighting((seen(3.0, 0.8),), 0.1, 0.1))
-    ahead = transform_from(np.eye(3), np.array([0.0, 0.0, 2.0]))
-    mode = belief.moved(ahead).modes[0]
+    mode = belief.moved(AHEAD).modes[0]
     np.testing.assert_allclose(mode.T_map_camera[:3, 3], [5.0, 0.0, 1.5], atol=1e-12)
     share, least_m, _, least_rad = ODOMETRY_STD
     of_odometry = (least_m + 2 * share) ** 2
@@ -146,7 +178,7 @@ def test_the_probabilities_of_one_frame():
 def test_look_alikes_share_the_probability_whatever_the_confidence():
     """Six equal candidates: the confidence of 0.95 cannot mean the first one alone."""
     found = sighting_of([seen(20.0 * k) for k in range(6)], np.full(6, 1 / 6), 0.95, 0.98)
-    assert found.candidates[0].probability == pytest.approx(0.98 / 6)
+    assert [each.probability for each in found.candidates] == pytest.approx([0.98 * (1 - MISSED) / 6] * 6)
     assert sum(each.probability for each in found.candidates) == pytest.approx(0.98 * (1 - MISSED))
 
 

@@ -11,12 +11,14 @@ import pytest
 from service.confidence.decision import Decision, Status
 from service.geometry.rigid import transform_from
 from service.localization import tracker
+from service.localization.belief import KIDNAPPED, KIDNAPPED_ON_THE_WAY, NEW_M
 from service.localization.localizer import Found, Localizer
 from service.localization.track_bytes import MOST_BYTES, packed, unpacked
 from service.localization.tracker import MOST_FRAMES, Track, follow
 from service.maps.reader import MapBundle
 from service.registration.register import Registered
 from service.retrieval.frame import Frame
+from service.retrieval.prior import Prior
 from service.retrieval.query import Query
 from service.retrieval.retrieve import Retrieved
 from service.scoring.candidates import Candidate, Refined
@@ -24,8 +26,8 @@ from service.timing import StageTimer
 
 LEVEL = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 SMALL = np.diag([0.01**2] * 6)
-#: The camera drives 1 m ahead, along map x.
-AHEAD = transform_from(np.eye(3), np.array([0.0, 0.0, 1.0]))
+#: The camera drives 2 m ahead, along map x: a whole new picture.
+AHEAD = transform_from(np.eye(3), np.array([0.0, 0.0, NEW_M]))
 THRESHOLD = 0.9
 
 
@@ -106,36 +108,38 @@ def drive(localizer, frame, monkeypatch):
 
 
 def test_a_sure_frame_needs_no_other(drive):
-    sure = [found(0.97, (float(k), 0.99)) for k in range(3)]
-    assert drive(sure) == [(0.0, "LOCALIZED", 0, 1), (1.0, "LOCALIZED", 0, 1), (2.0, "LOCALIZED", 0, 1)]
+    sure = [found(0.97, (2.0 * k, 0.99)) for k in range(3)]
+    assert drive(sure) == [(0.0, "LOCALIZED", 0, 1), (2.0, "LOCALIZED", 0, 1), (4.0, "LOCALIZED", 0, 1)]
 
 
 def test_frames_that_are_unsure_alone_become_sure_by_agreement(drive):
     """0.7, then 0.7 x 2 x 0.7 against 0.28 x 0.28 and 0.02 x 0.02: above 0.9."""
-    unsure = [found(0.7, (float(k), 0.99)) for k in range(2)]
-    answers = drive(unsure, together=found(0.6, (1.0, 0.9)))
+    unsure = [found(0.7, (2.0 * k, 0.99)) for k in range(2)]
+    answers = drive(unsure, together=found(0.6, (2.0, 0.9)))
     assert [status for _, status, _, _ in answers] == ["AMBIGUOUS", "LOCALIZED"]
 
 
 def test_frames_together_decide_what_one_frame_cannot(drive):
-    alone = [found(0.3, (float(k), 0.9)) for k in range(2)]
-    assert drive(alone, together=found(0.95, (1.0, 0.95)))[-1] == (1.0, "LOCALIZED", 0, 2)
+    alone = [found(0.3, (2.0 * k, 0.9)) for k in range(2)]
+    assert drive(alone, together=found(0.95, (2.0, 0.95)))[-1] == (2.0, "LOCALIZED", 0, 2)
 
 
-def test_look_alikes_stay_ambiguous(drive):
-    alike = [found(0.9, (float(k), 0.5), (50.0 + k, 0.5)) for k in range(6)]
+@pytest.mark.parametrize("threshold", [0.9, 0.3, 0.13])
+def test_look_alikes_stay_ambiguous_whatever_the_threshold(drive, monkeypatch, threshold):
+    monkeypatch.setattr(f"{__name__}.THRESHOLD", threshold)
+    alike = [found(0.9, (2.0 * k, 0.5), (50.0 + 2 * k, 0.5)) for k in range(6)]
     answers = drive(alike, together=found(0.9, (0.0, 0.5), (50.0, 0.5)))
     assert {status for _, status, _, _ in answers} == {"AMBIGUOUS"}
 
 
 def test_a_displaced_robot_is_ambiguous_once_and_then_begins_an_epoch(drive):
     """The frames before still point to the old place, and all frames together would be LOCALIZED there."""
-    old = [found(0.97, (float(k), 0.99)) for k in range(3)]
-    new = [found(0.97, (100.0 + k, 0.99)) for k in range(3)]
-    answers = drive(old + new, together=found(0.95, (3.0, 0.95)))
+    old = [found(0.97, (2.0 * k, 0.99)) for k in range(3)]
+    new = [found(0.97, (100.0 + 2 * k, 0.99)) for k in range(3)]
+    answers = drive(old + new, together=found(0.95, (6.0, 0.95)))
     assert [status for _, status, _, _ in answers] == ["LOCALIZED"] * 3 + ["AMBIGUOUS"] + ["LOCALIZED"] * 2
     assert [epoch for _, _, epoch, _ in answers] == [0, 0, 0, 0, 1, 1]
-    assert answers[4][0] == 101.0
+    assert answers[4][0] == 102.0
 
 
 def test_unknown_odometry_begins_an_epoch_if_a_pose_was_given_before(localizer, frame, monkeypatch):
@@ -151,14 +155,14 @@ def test_unknown_odometry_begins_an_epoch_if_a_pose_was_given_before(localizer, 
 
 def test_the_modes_are_starts_of_the_next_registration(localizer, frame, monkeypatch):
     monkeypatch.setattr(tracker, "extrapolated", lambda *_: ())
-    scripted = Scripted(localizer.answer((frame,)), [found(0.6, (0.0, 0.7), (50.0, 0.3)), found(0.97, (1.0, 0.99))])
+    scripted = Scripted(localizer.answer((frame,)), [found(0.6, (0.0, 0.7), (50.0, 0.3)), found(0.97, (2.0, 0.99))])
     _, track = follow(scripted, frame, Track(), None, StageTimer())
     follow(scripted, frame, track, AHEAD, StageTimer())
     assert scripted.predicted == [0, 2]
 
 
-@pytest.mark.parametrize(("rate", "weight"), [(0.01, 0.97), (0.02, 0.97 * 0.99)])
-def test_a_frame_out_of_range_says_nothing_at_the_default_rate(localizer, frame, monkeypatch, rate, weight):
+@pytest.mark.parametrize("rate", [0.01, 0.02])
+def test_a_frame_out_of_range_says_nothing_at_the_default_rate(localizer, frame, monkeypatch, rate):
     """At a higher rate, the frame counts as any other: here it finds another place, and the first mode loses its weight."""
     template = localizer.answer((frame,))
     asked = replace(frame, query=replace(frame.query, false_accept_rate=rate))
@@ -171,16 +175,52 @@ def test_a_frame_out_of_range_says_nothing_at_the_default_rate(localizer, frame,
     assert answer.belief is not None
     first = answer.belief.modes[0]
     if rate == 0.01:
-        assert (first.weight, first.unseen) == (pytest.approx(0.97 * 0.99), 1)
+        assert (first.weight, first.unseen) == (pytest.approx(0.97 * (1 - KIDNAPPED - KIDNAPPED_ON_THE_WAY)), 1)
     else:
         assert len(answer.belief.modes) == 2
         assert answer.belief.modes[0].weight < 0.9
 
 
+def test_frames_of_one_position_are_not_registered_together(localizer, frame):
+    track, counts = Track(), []
+    for number in range(4):
+        answer, track = follow(localizer, frame, track, np.eye(4) if number else None, StageTimer())
+        counts.append(answer.frames)
+    assert (counts, len(track.frames)) == ([1, 1, 1, 1], 1)
+
+
+def test_a_prior_counts_once(localizer, frame, monkeypatch):
+    """The first frame uses its decision with the prior. Later frames decide again without it."""
+    monkeypatch.setattr(tracker, "extrapolated", lambda *_: ())
+    monkeypatch.setattr(tracker, "decision_of", lambda *_: Decision("AMBIGUOUS", 0.1, 0.2))
+    asked = replace(frame, query=replace(frame.query, prior=Prior(position_m=np.zeros(2))))
+    scripted = Scripted(
+        localizer.answer((frame,)), [found(0.8, (2.0 * k, 0.99)) for k in range(2)], found(0.5, (2.0, 0.9))
+    )
+    first, track = follow(scripted, asked, Track(), None, StageTimer())
+    second, _ = follow(scripted, asked, track, AHEAD, StageTimer())
+    assert first.belief is not None
+    assert second.belief is not None
+    assert first.belief.modes[0].weight == pytest.approx(0.8)
+    assert second.belief.modes[0].weight < 0.85  # 0.97 if the prior counted again
+
+
+def test_a_frame_without_registration_keeps_the_belief(localizer, frame, monkeypatch):
+    monkeypatch.setattr(tracker, "extrapolated", lambda *_: ())
+    scripted = Scripted(localizer.answer((frame,)), [found(0.97, (0.0, 0.99)), found(0.97, (100.0, 0.99))])
+    scripted.answer = lambda *_: scripted.template  # type: ignore[method-assign]
+    _, track = follow(scripted, frame, Track(), None, StageTimer())
+    unregistered = replace(frame, query=replace(frame.query, refine=False))
+    _, track = follow(scripted, unregistered, track, AHEAD, StageTimer())
+    assert (track.belief.modes[0].unseen, track.last is None) == (1, False)
+    answer, _ = follow(scripted, frame, track, AHEAD, StageTimer())
+    assert answer.epoch == 1
+
+
 def test_a_map_without_calibration_registers_the_last_frames_together(localizer, frame):
     track, counts = Track(), []
     for number in range(MOST_FRAMES + 1):
-        answer, track = follow(localizer, frame, track, np.eye(4) if number else None, StageTimer())
+        answer, track = follow(localizer, frame, track, AHEAD if number else None, StageTimer())
         counts.append(answer.frames)
         assert answer.belief is None
     assert counts == [1, 2, 3, 4, 5, 5]
@@ -188,7 +228,7 @@ def test_a_map_without_calibration_registers_the_last_frames_together(localizer,
 
 def test_a_carried_track_continues_as_a_kept_one(localizer, frame, monkeypatch):
     monkeypatch.setattr(tracker, "extrapolated", lambda *_: ())
-    frames = [found(0.97, (float(k), 0.9), (50.0 + k, 0.1)) for k in range(2)]
+    frames = [found(0.97, (2.0 * k, 0.9), (50.0 + 2 * k, 0.1)) for k in range(2)]
     scripted = Scripted(localizer.answer((frame,)), frames)
     _, track = follow(scripted, frame, Track(epoch=3), AHEAD, StageTimer())
     content = packed(track, map_version="tiny@1")

@@ -190,3 +190,22 @@ def test_every_number_has_a_least_and_a_most() -> None:
     found = dict([*bounds_of(Settings), *bounds_of(Limits)])
     assert len(found) > 15
     assert [name for name, bounds in found.items() if not (bounds & {"ge", "gt"} and bounds & {"le", "lt"})] == []
+
+
+@pytest.mark.parametrize("secret", ["hunter2", "0123456789012345678901234567890"])
+def test_an_invalid_secret_is_not_shown(monkeypatch: pytest.MonkeyPatch, secret: str) -> None:
+    monkeypatch.setenv("STREETFIX_BELIEF_KEY", secret)
+    with pytest.raises(RequestError, match="32 random characters or more") as caught:
+        load_settings()
+    assert secret not in str(caught.value)
+    assert caught.value.field == "belief_key"
+
+
+def test_an_empty_secret_is_none_and_a_valid_one_is_masked(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("STREETFIX_BELIEF_KEY", "")
+    assert load_settings().belief_key is None
+    monkeypatch.setenv("STREETFIX_BELIEF_KEY", "s" * 32)
+    settings = load_settings()
+    assert settings.belief_key is not None
+    assert settings.belief_key.get_secret_value() == "s" * 32
+    assert "sss" not in settings.model_dump_json()

@@ -12,11 +12,14 @@ import pytest
 
 from service import timing
 from service.geometry.camera import PinholeCamera
+from service.geometry.rigid import transform_from
 from service.localization.answer import Timings
 from service.runtime.engine import EncodedQuery, Engine
 from service.runtime.settings import Settings
 from service.runtime.stream import Stream
 
+#: The camera moved 1 m along its optical axis.
+AHEAD = transform_from(np.eye(3), np.array([0.0, 0.0, 1.0]))
 ONE = Timings(decode_ms=1e3, fuse_ms=1e3, encode_ms=1e3, search_ms=2e3, register_ms=2e3, total_ms=7e3)
 
 
@@ -49,5 +52,5 @@ def test_frames_of_a_sequence_add_up(engine: Engine, encoded: EncodedQuery) -> N
 def test_a_frame_that_a_stream_keeps_counts_in_its_own_request_only(engine: Engine, encoded: EncodedQuery) -> None:
     stream = Stream(engine)
     for frames in (1, 2, 3):
-        located, used = stream.localize(encoded, np.eye(4))
+        located, used = stream.localize(encoded, AHEAD)
         assert (located.answer.timings, used) == (ONE, frames)
