@@ -70,7 +70,7 @@ def test_answers_are_compared_with_the_truth(bundle_path: Path, pictures: Any):
     np.testing.assert_array_equal(found.right(1.0), [[True, True], [False, False]])
     np.testing.assert_array_equal(found.wrong(1.0), [[False, False], [True, True]])
     assert found.error_m[1, 0] == pytest.approx(5.0)
-    assert (found.frames.tolist(), told) == ([[1, 2], [1, 2]], [1, 2])
+    assert (found.frames.tolist(), told) == ([[1, 1], [1, 1]], [1, 2])
 
 
 def test_a_refused_answer_is_neither_right_nor_wrong():

@@ -428,6 +428,7 @@ def test_a_stream_goes_on_when_another_map_comes_beside_its_own(
 ) -> None:
     from service.contract.convert import parsed, query_from
     from service.contract.schema import LocalizeRequest
+    from service.geometry.rigid import transform_from
     from service.localization.localizer import Localizer
     from service.maps.reader import MapBundle
     from service.maps.writer import write_bundle
@@ -436,14 +437,14 @@ def test_a_stream_goes_on_when_another_map_comes_beside_its_own(
     engine = Engine.open(Settings(maps=(bundle_path,), threads=1))
     parts = parts_of()
     query = query_from(parsed(parts["request"], LocalizeRequest), rgb=parts["rgb"], depth=parts["depth"])
-    stream = Stream(engine)
+    stream, ahead = Stream(engine), transform_from(np.eye(3), np.array([0.0, 0.0, 1.0]))
     assert stream.localize(query, None)[1] == 1
     write_bundle(tmp_path / "west", content_of(name="west"))
     engine.registry.mount(Localizer.open(MapBundle.open(tmp_path / "west")))
-    assert stream.localize(query, np.eye(4))[1] == 2
+    assert stream.localize(query, ahead)[1] == 2
     write_bundle(tmp_path / "new", content_of(seed=1))
     engine.registry.mount(Localizer.open(MapBundle.open(tmp_path / "new")))
-    assert stream.localize(query, np.eye(4))[1] == 1  # what was looked up is not of the new version
+    assert stream.localize(query, ahead)[1] == 1  # what was looked up is not of the new version
     engine.close()
 
 
