@@ -245,7 +245,7 @@ WHY_MISSED: dict[str, Reason] = {
         "files have one task each: host and key, route, body, memory and queue, fields, conversion",
     ),
     "request.files_in_core": Reason(
-        52,
+        56,
         "The count includes all files whose functions one request calls. 13 decode, level and fuse images, 7 retrieve, 6 "
         "register, 6 score, 3 decide, 4 build the answer, 5 read the map, 2 are geometry, 6 belong to the engine. Each stage "
         "has a package, and the localizer has five steps. Tried: packages by stage with small files joined (56 to 52), and "

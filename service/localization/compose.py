@@ -1,48 +1,43 @@
 """Build the answer from the results of the stages."""
 
 import numpy as np
-from jaxtyping import Float64
-from numpy.typing import NDArray
 
-from service.confidence.decision import Outcome
+from service.confidence.decision import outcome_of
+from service.confidence.spread import Extent
 from service.geometry.rigid import Transform, inverse, transform_from
 from service.imaging.query_view import QueryViews
 from service.localization.answer import Answer, Timings, require_finite
+from service.localization.found import Found
 from service.maps.reader import MapBundle
 from service.retrieval.frame import Frame
 from service.retrieval.hypotheses import Hypothesis
 from service.retrieval.knn import Neighbour
-from service.retrieval.retrieve import Retrieved
-from service.scoring.candidates import Candidate, Refined
+from service.scoring.candidates import Candidate
 from service.timing import StageTimer
 
 #: Largest distance at which a registered pose verifies a place.
 VERIFIED_M = 5.0
 
 
-def compose(
-    bundle: MapBundle,
-    frames: tuple[Frame, ...],
-    retrieved: Retrieved,
-    refined: Refined | None,
-    evidence: Float64[NDArray[np.float64], " F"] | None,
-    outcome: Outcome,
-    timer: StageTimer,
-) -> Answer:
+def compose(bundle: MapBundle, frames: tuple[Frame, ...], found: Found, extent: Extent, timer: StageTimer) -> Answer:
     """Build an answer from the results of all stages.
 
     Args:
         bundle: the map.
         frames: image pairs, the reference first.
-        retrieved: places, clusters and street vote of the reference.
-        refined: registered candidates; None if nothing was registered.
-        evidence: confidence features; None without ``refined``.
-        outcome: status, confidence, candidates, spread and reasons.
-        timer: of the request.
+        found: places, registered candidates, confidence features and decision.
+        extent: extent of the map.
+        timer: of the request. Reasons and spread count as registration.
 
     Raises:
         NotFiniteError: a number of the answer is not finite, because of a defect of this program or of the map.
     """
+    retrieved, refined, evidence, decision = found.retrieved, found.refined, found.evidence, found.decision
+    with timer.stage("register"):
+        calibration = None if decision is None else bundle.calibration
+        outcome = outcome_of(
+            calibration, frames[0].query, refined, evidence, decision, frames=len(frames), extent=extent
+        )
     query, views, heaviest = frames[0].query, frames[0].views, retrieved.hypotheses[0]
     T_map_camera = _pose_of(bundle, heaviest, views) if refined is None else refined.best.T_map_camera
     count = max(query.neighbours, query.ranked)

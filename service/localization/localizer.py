@@ -1,43 +1,24 @@
 """Localize a query in a map: retrieve places as the paper does, register candidates on the map cloud, and decide."""
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
-from jaxtyping import Float64
-from numpy.typing import NDArray
 
-from service.confidence.decision import Decision, decision_of, outcome_of, require_promise
+from service.confidence.decision import decision_of, require_promise
 from service.confidence.features import evidence_of, require_features
 from service.confidence.spread import Extent
 from service.geometry.rigid import Transform
 from service.localization.answer import Answer
 from service.localization.compose import compose
+from service.localization.found import Found
 from service.localization.refine import RefineSettings, refine
 from service.maps.reader import MapBundle
 from service.retrieval.encoder import Encoder, Provider
 from service.retrieval.frame import Frame
 from service.retrieval.hypotheses import ClusterSettings
 from service.retrieval.query import Query
-from service.retrieval.retrieve import Retrieved, look_up, require_encoder_of, retrieve
-from service.scoring.candidates import Refined
+from service.retrieval.retrieve import look_up, require_encoder_of, retrieve
 from service.timing import StageTimer
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Found:
-    """What a query has found before its answer is built.
-
-    Attributes:
-        retrieved: places, clusters and street vote of the reference.
-        refined: registered candidates; None if nothing was registered.
-        evidence: confidence features; None without ``refined``.
-        decision: status and confidence; None if the query asked for no registration, or the map has no cloud or no calibration.
-    """
-
-    retrieved: Retrieved
-    refined: Refined | None
-    evidence: Float64[NDArray[np.float64], " F"] | None
-    decision: Decision | None
 
 
 class Localizer:
@@ -64,10 +45,8 @@ class Localizer:
     ) -> None:
         require_encoder_of(bundle, encoder)
         require_features(bundle.calibration, str(bundle.path))
-        self.bundle = bundle
-        self.encoder = encoder
-        self.clusters = clusters or ClusterSettings()
-        self.refining = refining or RefineSettings()
+        self.bundle, self.encoder = bundle, encoder
+        self.clusters, self.refining = clusters or ClusterSettings(), refining or RefineSettings()
         self.extent = Extent.of_places(bundle.T_map_place[:, :3, 3], bundle.manifest.spacing_m)
 
     @classmethod
@@ -113,17 +92,8 @@ class Localizer:
             NotFiniteError: a number of the answer is not finite, because of a defect of this program or of the map.
         """
         timer, pairs = StageTimer(), zip(queries, T_reference_camera, strict=True)
-        return self.answer(
-            tuple(replace(self.look_up(query, timer), T_reference_camera=T) for query, T in pairs), timer
-        )
-
-    def decides(self, query: Query) -> bool:
-        """Return whether an answer to a query has a confidence: the map has a cloud and a calibration, and the query wants registration.
-
-        Args:
-            query: the reference.
-        """
-        return query.refine and self.bundle.cloud is not None and self.bundle.calibration is not None
+        frames = (replace(self.look_up(query, timer), T_reference_camera=T) for query, T in pairs)
+        return self.answer(tuple(frames), timer)
 
     def look_up(self, query: Query, timer: StageTimer | None = None) -> Frame:
         """Encode one image pair and search the map for similar views, without registration.
@@ -174,13 +144,11 @@ class Localizer:
             # 2. Registration: refine candidate poses on the map cloud, and rank them.
             refined = None if cloud is None else refine(bundle, cloud, frames, query.prior, self.refining, predicted)
             # 3. Confidence features of the best candidate and its rivals.
-            evidence = None
-            if refined is not None:
-                places_m, grid = bundle.T_map_place[:, :2, 3], bundle.grid
-                evidence = evidence_of(frames, refined, retrieved.neighbours, retrieved.hypotheses, places_m, grid)
+            near, clusters, places_m = retrieved.neighbours, retrieved.hypotheses, bundle.T_map_place[:, :2, 3]
+            evidence = refined and evidence_of(frames, refined, near, clusters, places_m, bundle.grid)
             # 4. Decision: status and calibrated confidence.
-            calibration = bundle.calibration if self.decides(query) else None
-            return Found(retrieved, refined, evidence, decision_of(calibration, query, refined, evidence))
+            decision = None if cloud is None else decision_of(bundle.calibration, query, refined, evidence)
+            return Found(retrieved, refined, evidence, decision)
 
     def compose(self, frames: tuple[Frame, ...], found: Found, timer: StageTimer) -> Answer:
         """Build the answer.
@@ -194,14 +162,4 @@ class Localizer:
             NotFiniteError: a number of the answer is not finite, because of a defect of this program or of the map.
         """
         # 5. Reasons and spread if the answer is not LOCALIZED. Then the answer, and a check that all its numbers are finite.
-        with timer.stage("register"):
-            outcome = outcome_of(
-                None if found.decision is None else self.bundle.calibration,
-                frames[0].query,
-                found.refined,
-                found.evidence,
-                found.decision,
-                frames=len(frames),
-                extent=self.extent,
-            )
-        return compose(self.bundle, frames, found.retrieved, found.refined, found.evidence, outcome, timer)
+        return compose(self.bundle, frames, found, self.extent, timer)

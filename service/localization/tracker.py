@@ -12,7 +12,8 @@ from service.confidence.extrapolation import extrapolated
 from service.geometry.rigid import Transform, inverse, nearest_rigid
 from service.localization.answer import Answer, require_finite
 from service.localization.belief import Belief, Mode, Seen, agrees, moved, sighting_of, size_of
-from service.localization.localizer import Found, Localizer
+from service.localization.found import Found
+from service.localization.localizer import Localizer
 from service.option_limits import FALSE_ACCEPT_RATE
 from service.retrieval.frame import Frame
 from service.scoring.candidates import RIVAL_M, Candidate, distinct_candidates, shares_of
@@ -86,7 +87,10 @@ def follow(
         )
         belief = track.belief.moved(T_previous_camera)
         last = None if track.last is None else moved(track.last, T_previous_camera)
-    if not localizer.decides(frame.query):  # there is no probability to believe
+    bundle = localizer.bundle
+    if (
+        not frame.query.refine or bundle.cloud is None or bundle.calibration is None
+    ):  # there is no probability to believe
         frames = (frame, *_apart(kept))
         following = Track(belief.unseen(), track.epoch, last, _window(frame, kept))
         return localizer.answer(frames, timer), following

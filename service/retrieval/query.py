@@ -90,7 +90,7 @@ class Query:
             rgb: sRGB image with the aspect ratio of the camera.
             depth_m: z of each pixel of the sent image, metres, 0 where nothing was measured. It has the aspect ratio of the camera.
             camera: intrinsics and distortion of both images.
-            baseline_m: baseline of the stereo rig that measured the depth; None if no rig is known.
+            baseline_m: baseline of the stereo rig that measured the depth, metres; None if no rig is known.
 
         Raises:
             RequestError: the distortion is not invertible over the image, or the rectified image would be empty.

@@ -12,7 +12,8 @@ from service.confidence.decision import Decision, Status
 from service.geometry.rigid import transform_from
 from service.localization import tracker
 from service.localization.belief import KIDNAPPED, KIDNAPPED_ON_THE_WAY, NEW_M
-from service.localization.localizer import Found, Localizer
+from service.localization.found import Found
+from service.localization.localizer import Localizer
 from service.localization.track_bytes import MOST_BYTES, packed, unpacked
 from service.localization.tracker import MOST_FRAMES, Track, follow
 from service.maps.reader import MapBundle
@@ -51,11 +52,8 @@ class Scripted(Localizer):
 
     def __init__(self, template: Any, alone: list[Found], together: Found | None = None) -> None:
         self.template, self.alone, self.together = template, iter(alone), together
-        self.bundle: Any = SimpleNamespace(calibration=SimpleNamespace(threshold=lambda _: THRESHOLD))
+        self.bundle: Any = SimpleNamespace(cloud=True, calibration=SimpleNamespace(threshold=lambda _: THRESHOLD))
         self.predicted: list[int] = []
-
-    def decides(self, query: Query) -> bool:
-        return query.refine
 
     def register(self, frames: tuple[Frame, ...], timer: StageTimer, predicted: tuple[Any, ...] = ()) -> Found:  # noqa: ARG002
         if len(frames) > 1:
