@@ -145,7 +145,7 @@ class Localizer:
             refined = None if cloud is None else refine(bundle, cloud, frames, query.prior, self.refining, predicted)
             # 3. Confidence features of the best candidate and its rivals.
             near, clusters, places_m = retrieved.neighbours, retrieved.hypotheses, bundle.T_map_place[:, :2, 3]
-            evidence = refined and evidence_of(frames, refined, near, clusters, places_m, bundle.grid)
+            evidence = None if refined is None else evidence_of(frames, refined, near, clusters, places_m, bundle.grid)
             # 4. Decision: status and calibrated confidence.
             decision = None if cloud is None else decision_of(bundle.calibration, query, refined, evidence)
             return Found(retrieved, refined, evidence, decision)
