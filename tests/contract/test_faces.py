@@ -2,7 +2,6 @@
 
 import json
 import re
-import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -11,17 +10,12 @@ import grpc
 import httpx
 import numpy as np
 import pytest
-import uvicorn
 from google.protobuf.json_format import MessageToDict
 
 from service.geometry.camera import PinholeCamera
 from service.geometry.distortion import rays_of
 from service.grpc.generated.streetfix.v1 import localization_pb2 as pb
 from service.grpc.generated.streetfix.v1.localization_pb2_grpc import LocalizationServiceStub
-from service.grpc.server import GrpcServer
-from service.http.app import create_app
-from service.runtime.engine import Engine
-from service.runtime.settings import Settings
 
 Parts = Callable[..., dict[str, bytes]]
 CAMERA = pb.Camera(width=64, height=48, fx=32, fy=32, cx=31.5, cy=23.5)
@@ -31,26 +25,10 @@ AHEAD = {"position": {"x": 0.0, "y": 0.0, "z": 1.0}, "orientation": {"x": 0.0, "
 
 
 @pytest.fixture(scope="module")
-def faces(bundle_path: Path) -> Iterator[tuple[httpx.Client, LocalizationServiceStub]]:
+def faces(bundle_path: Path, serving: Any) -> Iterator[tuple[httpx.Client, LocalizationServiceStub]]:
     """REST and gRPC on one engine."""
-    engine = Engine.open(Settings(maps=(bundle_path,), threads=1, queue=16))
-    server = uvicorn.Server(uvicorn.Config(create_app(engine), port=0, log_config=None, lifespan="off"))
-    thread = threading.Thread(target=server.run)
-    thread.start()
-    while not server.started:
-        assert thread.is_alive()
-    port = server.servers[0].sockets[0].getsockname()[1]
-    grpc_server = GrpcServer(engine, host="127.0.0.1", port=0)
-    grpc_server.start()
-    with (
-        grpc.insecure_channel(f"127.0.0.1:{grpc_server.port}") as channel,
-        httpx.Client(base_url=f"http://127.0.0.1:{port}") as client,
-    ):
-        yield client, LocalizationServiceStub(channel)
-    grpc_server.stop(grace_s=1)
-    server.should_exit = True
-    thread.join()
-    engine.close()
+    with serving(bundle_path) as (client, stub, _):
+        yield client, stub
 
 
 def flat(answer: dict[str, Any]) -> dict[str, Any]:

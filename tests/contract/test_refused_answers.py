@@ -1,29 +1,22 @@
 """An answer that is not LOCALIZED carries no pose, whatever face and call it comes through. A real map refuses here."""
 
 import json
-import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
-import grpc
 import httpx
 import numpy as np
 import pytest
-import uvicorn
 
 from service.client import Client, GrpcClient, NotLocalizedError, Options
 from service.confidence.features import FEATURES
 from service.contract.schema import LocalizeAnswer
 from service.grpc.generated.streetfix.v1 import localization_pb2 as pb
 from service.grpc.generated.streetfix.v1.localization_pb2_grpc import LocalizationServiceStub
-from service.grpc.server import GrpcServer
-from service.http.app import create_app
 from service.maps.content import BundleContent
 from service.maps.writer import write_bundle
-from service.runtime.engine import Engine
-from service.runtime.settings import Settings
 
 Parts = Callable[..., dict[str, bytes]]
 NONE = ("pose", "vehicle_pose", "geopose", "street")
@@ -50,7 +43,10 @@ def calibration(*, known: float) -> dict[str, Any]:
 
 @pytest.fixture(scope="module", params=["AMBIGUOUS", "OUT_OF_MAP"])
 def refusing(
-    request: pytest.FixtureRequest, content_of: Callable[..., BundleContent], tmp_path_factory: pytest.TempPathFactory
+    request: pytest.FixtureRequest,
+    content_of: Callable[..., BundleContent],
+    tmp_path_factory: pytest.TempPathFactory,
+    serving: Any,
 ) -> Iterator[Any]:
     """Both faces over a map on the Earth that answers a strict question with the status of the parameter."""
     folder: Path = tmp_path_factory.mktemp("refusing") / "tiny"
@@ -61,23 +57,8 @@ def refusing(
             georeference={"latitude_deg": 48.0, "longitude_deg": 11.0, "height_m": 500.0},
         ),
     )
-    engine = Engine.open(Settings(maps=(folder,), threads=1, queue=16, false_accept_rate=STRICT))
-    server = uvicorn.Server(uvicorn.Config(create_app(engine), port=0, log_config=None, lifespan="off"))
-    thread = threading.Thread(target=server.run)
-    thread.start()
-    while not server.started:
-        assert thread.is_alive()
-    url = f"http://127.0.0.1:{server.servers[0].sockets[0].getsockname()[1]}"
-    faces = GrpcServer(engine, host="127.0.0.1", port=0)
-    faces.start()
-    address = f"127.0.0.1:{faces.port}"
-    with grpc.insecure_channel(address) as channel, httpx.Client(base_url=url) as client:
-        stub = LocalizationServiceStub(channel)
-        yield SimpleNamespace(status=request.param, client=client, stub=stub, url=url, address=address)
-    faces.stop(grace_s=1)
-    server.should_exit = True
-    thread.join()
-    engine.close()
+    with serving(folder, false_accept_rate=STRICT) as (client, stub, address):
+        yield SimpleNamespace(status=request.param, client=client, stub=stub, url=str(client.base_url), address=address)
 
 
 def posted(client: httpx.Client, path: str, parts: dict[str, bytes], **headers: str) -> httpx.Response:

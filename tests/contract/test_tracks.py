@@ -2,29 +2,22 @@
 
 import base64
 import json
-import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
-import grpc
 import httpx
 import numpy as np
 import pytest
-import uvicorn
 
 from service.client import Client, GrpcClient, PinholeCamera, RefusedError, RequestError, Track
 from service.confidence.features import FEATURES
 from service.contract.schema import MOST_TOKEN
 from service.grpc.generated.streetfix.v1 import localization_pb2 as pb
 from service.grpc.generated.streetfix.v1.localization_pb2_grpc import LocalizationServiceStub
-from service.grpc.server import GrpcServer
-from service.http.app import create_app
 from service.localization.track_bytes import MOST_BYTES
 from service.maps.content import BundleContent
 from service.maps.writer import write_bundle
-from service.runtime.engine import Engine
-from service.runtime.settings import Settings
 
 Parts = Callable[..., dict[str, bytes]]
 CAMERA = pb.Camera(width=64, height=48, fx=32, fy=32, cx=31.5, cy=23.5)
@@ -57,29 +50,13 @@ def calibration() -> dict[str, Any]:
 
 @pytest.fixture(scope="module")
 def faces(
-    content_of: Callable[..., BundleContent], tmp_path_factory: pytest.TempPathFactory
+    content_of: Callable[..., BundleContent], tmp_path_factory: pytest.TempPathFactory, serving: Any
 ) -> Iterator[tuple[httpx.Client, LocalizationServiceStub, str]]:
     """REST, gRPC, and the address of gRPC, on one engine."""
     folder: Path = tmp_path_factory.mktemp("tracks") / "tiny"
     write_bundle(folder, content_of(calibration=calibration()))
-    engine = Engine.open(Settings(maps=(folder,), threads=1, queue=16))
-    server = uvicorn.Server(uvicorn.Config(create_app(engine), port=0, log_config=None, lifespan="off"))
-    thread = threading.Thread(target=server.run)
-    thread.start()
-    while not server.started:
-        assert thread.is_alive()
-    port = server.servers[0].sockets[0].getsockname()[1]
-    grpc_server = GrpcServer(engine, host="127.0.0.1", port=0)
-    grpc_server.start()
-    with (
-        grpc.insecure_channel(f"127.0.0.1:{grpc_server.port}") as channel,
-        httpx.Client(base_url=f"http://127.0.0.1:{port}") as client,
-    ):
-        yield client, LocalizationServiceStub(channel), f"127.0.0.1:{grpc_server.port}"
-    grpc_server.stop(grace_s=1)
-    server.should_exit = True
-    thread.join()
-    engine.close()
+    with serving(folder) as both:
+        yield both
 
 
 def posted(client: httpx.Client, parts: dict[str, bytes]) -> httpx.Response:
