@@ -661,7 +661,7 @@ class LocalizeAnswer(BaseModel):
     )
     belief: Belief | None = Field(
         None,  # an earlier service sends none
-        description="where the robot may be, after all frames of its track. Null without a track, and if confidence is null",
+        description="where the robot may be, after all frames of its track. Null without a track, and if the map has no calibration",
     )
     map: MapVersion
     timings_ms: TimingsMs

@@ -88,12 +88,11 @@ def follow(
         belief = track.belief.moved(T_previous_camera)
         last = None if track.last is None else moved(track.last, T_previous_camera)
     bundle = localizer.bundle
-    if (
-        not frame.query.refine or bundle.cloud is None or bundle.calibration is None
-    ):  # there is no probability to believe
-        frames = (frame, *_apart(kept))
+    is_calibrated = bundle.cloud is not None and bundle.calibration is not None
+    if not frame.query.refine or not is_calibrated:  # the frame has no probability
         following = Track(belief.unseen(), track.epoch, last, _window(frame, kept))
-        return localizer.answer(frames, timer), following
+        answer = localizer.answer((frame, *_apart(kept)), timer)
+        return replace(answer, belief=following.belief, epoch=track.epoch) if is_calibrated else answer, following
     predicted = tuple(mode.T_map_camera for mode in belief.modes[:PREDICTED])
     alone = localizer.register((frame,), timer, predicted)
     with timer.stage("register"):

@@ -209,7 +209,8 @@ def test_a_frame_without_registration_keeps_the_belief(localizer, frame, monkeyp
     scripted.answer = lambda *_: scripted.template  # type: ignore[method-assign]
     _, track = follow(scripted, frame, Track(), None, StageTimer())
     unregistered = replace(frame, query=replace(frame.query, refine=False))
-    _, track = follow(scripted, unregistered, track, AHEAD, StageTimer())
+    plain, track = follow(scripted, unregistered, track, AHEAD, StageTimer())
+    assert plain.belief is track.belief
     assert (track.belief.modes[0].unseen, track.last is None) == (1, False)
     answer, _ = follow(scripted, frame, track, AHEAD, StageTimer())
     assert answer.epoch == 1
