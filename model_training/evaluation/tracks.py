@@ -8,14 +8,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from model_training.datasets.dataset import Dataset, QueryFrame
+from model_training.evaluation.odometry import odometry_between
 from service.errors import NoDepthError
-from service.geometry.rigid import Transform, inverse, rotation_y, transform_from
+from service.geometry.rigid import Transform, transform_from
 from service.localization.localizer import Localizer
 from service.localization.tracker import Track, follow
 from service.timing import StageTimer
 
-#: Standard deviations of the odometry's error from frame to frame: translation as a share of the distance, and yaw.
-_WAY, _TURN_RAD = 0.01, float(np.deg2rad(0.2))
 #: Progress callback: stage, finished steps, all steps.
 Report = Callable[[str, int, int], None]
 
@@ -90,7 +89,7 @@ def steps_of(frames: Sequence[QueryFrame], rng: np.random.Generator) -> list[Ste
     """
     steps = [Step(frames[0], None)]
     for before, frame in pairwise(frames):
-        steps.append(Step(frame, _odometry(_true(before), _true(frame), rng)))
+        steps.append(Step(frame, odometry_between(_true(before), _true(frame), rng)))
     return steps
 
 
@@ -145,9 +144,3 @@ def _true(frame: QueryFrame) -> Transform:
     if frame.T_map_camera is None:
         raise ValueError("the frame has no true pose")
     return frame.T_map_camera
-
-
-def _odometry(T_map_previous: Transform, T_map_camera: Transform, rng: np.random.Generator) -> Transform:
-    step: Transform = inverse(T_map_previous) @ T_map_camera
-    way = float(np.linalg.norm(step[:3, 3]))
-    return step @ transform_from(rotation_y(rng.normal(0, _TURN_RAD)), rng.normal(0, _WAY * way, 3))
