@@ -59,9 +59,12 @@ class RegistrationSettings:
         ground_m: points lower than this above the ground do not count in the score, m.
     """
 
-    offsets_m: tuple[tuple[float, float], ...] = ((0.0, 0.0), (1.8, 0.0), (-1.8, 0.0), (0.0, 1.2), (0.0, -1.2))
+    offsets_m: tuple[tuple[float, float], ...] = (
+        (0.0, 0.0), (1.0, 0.0), (-1.0, 0.0), (2.2, 0.0), (-2.2, 0.0), (0.0, 1.2), (0.0, -1.2),
+        (1.2, 1.2), (-1.2, 1.2), (1.2, -1.2), (-1.2, -1.2),
+    )  # fmt: skip
     turns_rad: tuple[float, ...] = (0.12, -0.12)
-    most_starts: int = 60
+    most_starts: int = 120
     coarse_points: int = 250
     kept: int = 16
     kept_of_each: tuple[int, int] = (2, 5)
