@@ -66,10 +66,10 @@ class RegistrationSettings:
     turns_rad: tuple[float, ...] = (0.12, -0.12)
     most_starts: int = 120
     coarse_points: int = 250
-    kept: int = 16
-    kept_of_each: tuple[int, int] = (2, 5)
+    kept: int = 24
+    kept_of_each: tuple[int, int] = (2, 8)
     middle_points: int = 400
-    refined: int = 6
+    refined: int = 10
     similarity_weight: float = 4.0
     apart_m: float = 0.5
     fine_weight: float = 1.0
