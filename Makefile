@@ -8,6 +8,8 @@ TORCH ?= torch==2.13.0
 STEPS ?= 6600
 SECOND_STEPS ?= 4000
 THIRD_STEPS ?= 1500
+FOURTH_STEPS ?= 5000
+FIFTH_STEPS ?= 7000
 # Further steps on the paper's city, for the encoder that stands beside it in the report.
 PAPER_STEPS ?= 400
 # Real stereo frames in KITTI's object layout.
@@ -183,8 +185,10 @@ encoder: .venv/.torch ## train and export the stock encoder again; resumes an in
 	$(BIN)/streetfix train --run runs/stock --cities 26 --turn 7.5 --steps $(STEPS) --precision bfloat16
 	$(BIN)/streetfix train --run runs/second --cities 26 --turn 7.5 --steps $(SECOND_STEPS) --rate 1e-3 --seed 7 --precision bfloat16 --start-from runs/stock
 	$(BIN)/streetfix train --recipe matched --run runs/third --turn 7.5 --steps $(THIRD_STEPS) --rate 6e-4 --seed 11 --start-from runs/second
-	$(BIN)/streetfix export runs/third --out runs/third/encoder.onnx
-	$(BIN)/streetfix quantize runs/third/encoder.onnx --out model_training/stock/encoder.onnx
+	$(BIN)/streetfix train --recipe rigs --run runs/fourth --turn 7.5 --steps $(FOURTH_STEPS) --rate 1e-3 --seed 13 --precision bfloat16 --start-from runs/third
+	$(BIN)/streetfix train --recipe rigs --run runs/fifth --turn 7.5 --steps $(FIFTH_STEPS) --rate 1e-3 --seed 17 --precision bfloat16 --start-from runs/fourth
+	$(BIN)/streetfix export runs/fifth --out runs/fifth/encoder.onnx
+	$(BIN)/streetfix quantize runs/fifth/encoder.onnx --cities 6 --seed 3 --out model_training/stock/encoder.onnx
 
 calibration: .venv/.torch ## run the calibration cities and fit confidence again, for the stock encoder
 	$(BIN)/streetfix calibrate --anew $(ARGS)

@@ -151,11 +151,11 @@ def _evidence(localizer: Localizer, query: Query) -> np.ndarray | float:
 def _predicted(
     localizer: Localizer, dataset: Dataset, name: str, report: Report, rig: Rig | None = None
 ) -> Predictions:
-    """Localize a query set; a set of sequences takes each sequence as one query."""
-    return predict(
-        localizer, dataset, name, frames_each=SEQUENCE if name.startswith("sequences_") else 1,
-        seen_by=None if rig is None else rig.seen, report=report,
-    )  # fmt: skip
+    """Localize a query set; the frames of a sequence, or of several cameras, are one query."""
+    together = 1 if rig is None else rig.cameras
+    frames_each = SEQUENCE if name.startswith("sequences_") else together
+    seen_by = None if rig is None else rig.seen
+    return predict(localizer, dataset, name, frames_each=frames_each, seen_by=seen_by, report=report)
 
 
 def _by(rig: Rig | None, kind: str) -> str:

@@ -46,6 +46,7 @@ class Family:
         stereo: focal length times baseline, and errors of the rectification; empty for modelled depth.
         depth: numbers that replace those of the modelled preset; empty for stereo matchers.
         beams: beams of a spinning LiDAR that measures the depth, degrees of elevation; empty for a depth image.
+        cameras: number of cameras around the vehicle whose frames are one query.
         kinds: kinds of the two cities.
         fitted: whether the calibration is fitted to it. Rigs that see too little are not: fewer than half of their answers are right, and
             they would lower the confidence of all other rigs. The service refuses their answers, because they lie outside of the range
@@ -63,6 +64,7 @@ class Family:
     stereo: StereoParameters = _MODELLED
     depth: DepthParameters = _PRESET
     beams: tuple[float, ...] = ()
+    cameras: int = 1
     kinds: tuple[str, str] = _BOTH_KINDS
     fitted: bool = True
 
@@ -130,6 +132,13 @@ FAMILIES = (
     Family("every_10_m", CameraPlan(width=640, height=480, horizontal_deg=90.0), 1.5, ("stereo",), "os1_128", 10.0, 1.8, _CAR),
     # The camera of the simulator, with a 16-beam survey.
     Family("vlp_16", CameraPlan(width=848, height=480, horizontal_deg=110.0), 1.5, ("stereo",), "vlp_16", 1.0, 1.8, _SLOW),
+    # An iPhone with LiDAR: 256 x 192 depth pixels, held upright, 5 m.
+    Family("iphone", CameraPlan(width=480, height=640, horizontal_deg=50.0), 1.4, ("precise",), "os1_64", 1.0, 1.6, _SLOW,
+           depth=DepthParameters(focal_baseline_px_m=200.0, noise_px=0.1, step_px=0.0, max_range_m=5.0), fitted=False),
+    # A survey with a LiDAR whose scans do not repeat and that hardly looks down.
+    Family("livox", CameraPlan(width=640, height=480, horizontal_deg=90.0), 1.2, ("stereo",), "livox_mid_360", 1.0, 1.5, _SLOW),
+    # Four cameras around the vehicle.
+    Family("four_cameras", CameraPlan(width=640, height=400, horizontal_deg=90.0), 1.5, ("stereo",), "hdl_32", 2.5, 1.8, _CAR, cameras=4),
 )  # fmt: skip
 
 
@@ -156,7 +165,7 @@ def family_plan(
         plan = QueryPlan(
             name=name, traversal=traversal, count=count, depths=family.depths, stereo_parameters=family.stereo,
             depth_parameters=family.depth, aside_m=1.5, heading_deg=10.0, followed=family.survey.followed, sequence=sequence,
-            step_m=None if sequence is None else 2.0,
+            step_m=None if sequence is None else 2.0, cameras=family.cameras if family.cameras > 1 and sequence is None else None,
         )  # fmt: skip
         if traversal % 2:
             return plan

@@ -118,7 +118,7 @@ def _asked_family(work: Path, encoder: Path, family: Family, *, anew: bool, repo
 
     def ask() -> list[Asked]:
         found = []
-        of_rig = Rig(family.name, beams_deg=family.beams)
+        of_rig = Rig(family.name, beams_deg=family.beams, cameras=family.cameras)
         for index, own in enumerate(cities):
             other = cities[(index + 1) % FAMILY_CITIES]
             here = _localizer(work, encoder, own, own.name, report)

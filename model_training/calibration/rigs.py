@@ -24,6 +24,7 @@ class Rig:
         height: height of the window, as a share of the image's height.
         stereo: the query states a stereo baseline. Registration then uses the noise of stereo matching and a free disparity offset.
         beams_deg: elevations of the beams that measure depth, degrees; empty for a depth image.
+        cameras: number of successive frames that are one query, because as many cameras took them together.
 
     Raises:
         ValueError: the window is empty or exceeds the image.
@@ -34,6 +35,7 @@ class Rig:
     height: float = 1.0
     stereo: bool = False
     beams_deg: tuple[float, ...] = ()
+    cameras: int = 1
 
     def __post_init__(self) -> None:
         """Refuse an empty window, and one that exceeds the image."""

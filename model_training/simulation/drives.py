@@ -21,6 +21,8 @@ from service.errors import DatasetError
 from service.geometry.rigid import R_BODY_OPTICAL, rotation_y, rotation_z, transform_from
 
 Transforms = NDArray[np.float64]
+#: Distance of several cameras from the centre of their vehicle, metres.
+RING_M = 0.5
 #: Distance between the frames of a sequence, metres.
 DEFAULT_STEP_M = 2.0
 
@@ -113,18 +115,21 @@ def query_candidates(city: City, plan: SimulationPlan, query: QueryPlan, survey:
 
 
 def followed(city: City, query: QueryPlan, poses: Transforms) -> Transforms:
-    """Return every pose preceded by the earlier frames of its sequence, in recording order; the poses themselves without a sequence.
+    """Return every pose preceded by the other frames of its query, in recording order; the poses themselves for single frames.
 
-    The vehicle drives straight. The camera keeps its height above the ground and its rotation.
+    In a sequence the vehicle drives straight. The camera keeps its height above the ground and its rotation. Several cameras stand on a
+    circle around the vehicle's centre and look outwards.
 
     Args:
         city: city of the poses.
-        query: query traversal: length and step of a sequence.
+        query: query traversal: length and step of a sequence, or number of cameras.
         poses: T_map_camera (n, 4, 4), metres.
 
     Returns:
-        T_map_camera (n * sequence, 4, 4), metres.
+        T_map_camera (n * frames, 4, 4), metres.
     """
+    if query.cameras is not None:
+        return np.array([each for T in poses for each in _around(T, query.cameras)])
     if query.sequence is None:
         return poses
     step_m, found = query.step_m or DEFAULT_STEP_M, []
@@ -136,6 +141,16 @@ def followed(city: City, query: QueryPlan, poses: Transforms) -> Transforms:
             moved[2, 3] += city.height(*moved[:2, 3]) - city.height(*T[:2, 3])
             found.append(moved)
     return np.array(found)
+
+
+def _around(T_map_camera: NDArray[np.float64], cameras: int) -> Transforms:
+    """Return the poses T_map_camera (cameras, 4, 4) of all cameras of a vehicle; the last one is the given camera, which looks ahead."""
+    ahead = T_map_camera[:3, 2] * [1, 1, 0]
+    centre = T_map_camera[:3, 3] - RING_M * ahead / np.linalg.norm(ahead)
+    turns = [rotation_z(2 * np.pi * k / cameras) for k in range(cameras - 1, -1, -1)]
+    return np.array(
+        [transform_from(R @ T_map_camera[:3, :3], centre + R @ (T_map_camera[:3, 3] - centre)) for R in turns]
+    )
 
 
 def _camera_on(T_map_lidar: NDArray[np.float64], plan: SimulationPlan, query: QueryPlan) -> NDArray[np.float64]:

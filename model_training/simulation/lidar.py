@@ -12,6 +12,7 @@ from model_training.simulation.reflectance import reflectance_of
 from model_training.simulation.scene import Scene
 from model_training.simulation.survey_drive import SurveyModel, moved_m
 from model_training.simulation.terrain import GroundPicture
+from service.geometry.rigid import rotation_z
 
 
 @dataclass(frozen=True, slots=True)
@@ -28,6 +29,8 @@ class LidarModel:
         dropout: share of returns that are lost.
         max_range_m: largest range, metres.
         beams_deg: elevation of each beam, degrees, from the top; empty: evenly spaced.
+        non_repetitive: the ``channels * columns`` points of a scan cover the field of view evenly, at other directions in each scan, like
+            those of a Livox sensor. The LiDAR then has no rings.
     """
 
     name: str
@@ -39,9 +42,15 @@ class LidarModel:
     dropout: float = 0.03
     max_range_m: float = 100.0
     beams_deg: tuple[float, ...] = ()
+    non_repetitive: bool = False
 
     def rays(self) -> NDArray[np.float32]:
-        """Return the N = channels * columns unit rays (N, 3), LiDAR frame, row by row from the top, azimuth ascending from -pi."""
+        """Return the N = channels * columns unit rays (N, 3), LiDAR frame, row by row from the top, azimuth ascending from -pi.
+
+        A LiDAR without rings has no rows: its rays come in the order of the points.
+        """
+        if self.non_repetitive:
+            return self._even_rays()
         beams_deg = self.beams_deg or np.linspace(self.top_deg, self.bottom_deg, self.channels)
         elevation = np.deg2rad(np.asarray(beams_deg))[:, None]
         azimuth = (np.arange(self.columns) / self.columns * 2 * np.pi - np.pi)[None, :]
@@ -51,7 +60,17 @@ class LidarModel:
         )
         return rays.reshape(-1, 3).astype(np.float32)
 
+    def _even_rays(self) -> NDArray[np.float32]:
+        """Rays that cover the field of view evenly: Roberts' R2 sequence (2018) over azimuth and elevation."""
+        azimuth, elevation = ((np.arange(self.channels * self.columns)[:, None] * _R2) % 1.0).T
+        azimuth = 2 * np.pi * azimuth - np.pi
+        elevation = np.deg2rad(self.bottom_deg + (self.top_deg - self.bottom_deg) * elevation)
+        flat = np.cos(elevation)
+        return np.stack([flat * np.cos(azimuth), flat * np.sin(azimuth), np.sin(elevation)], axis=1).astype(np.float32)
 
+
+#: Steps of Roberts' R2 sequence: 1/p and 1/p^2, where p^3 = p + 1.
+_R2 = np.array([0.7548776662466927, 0.5698402909980532])
 #: Beams of the HDL-64E: two blocks of 32 beams, spaced 1/3 and 1/2 degree (Velodyne, HDL-64E S2 manual).
 _HDL_64 = tuple(2.0 - k / 3 for k in range(32)) + tuple(-8.83 - k / 2 for k in range(32))
 #: Beams of the Pandar64: dense near the horizon, sparse above and below it (Hesai, Pandar64 manual; rounded to 0.01 degrees).
@@ -77,6 +96,8 @@ LIDARS = {
         LidarModel("os1_64", 64, 1024, 16.6, -16.6),
         LidarModel("os1_128", 128, 1024, 22.5, -22.5),
         _with_beams("pandar_64", _PANDAR_64),
+        # 200,000 points per second for 0.2 s (Livox, Mid-360 manual).
+        LidarModel("livox_mid_360", 40, 1024, 52.0, -7.0, 0.02, 0.03, 70.0, non_repetitive=True),
     )
 }
 
@@ -119,6 +140,8 @@ def scan(
         distance, as sensors report it. It is not corrected for the angle of incidence, which a sensor does not know.
     """
     R = T_map_lidar[:3, :3].astype(np.float32)
+    if model.non_repetitive:
+        rays = rays @ rotation_z(rng.uniform(-np.pi, np.pi)).T.astype(np.float32)
     rays_map = rays @ R.T
     origin, offsets = T_map_lidar[:3, 3], None
     if survey.speed_m_s > 0:

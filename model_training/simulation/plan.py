@@ -88,6 +88,7 @@ class QueryPlan(_Model):
         sun_azimuth_deg: azimuth of the sun, degrees from east, counter-clockwise; None: random.
         sequence: number of frames in a row, of which the last is at the drawn pose; None: single frames.
         step_m: distance between the frames of a sequence, metres; None: ``drives.DEFAULT_STEP_M``.
+        cameras: number of cameras around the vehicle that take a query's frames together, of which the last looks ahead; None: one.
     """
 
     name: str = Field(pattern=r"^[a-z0-9_]+$")
@@ -113,6 +114,7 @@ class QueryPlan(_Model):
     sun_azimuth_deg: float | None = Field(None, ge=-360, le=360)
     sequence: int | None = Field(None, ge=2, le=20)
     step_m: float | None = Field(None, ge=0.1, le=10)
+    cameras: int | None = Field(None, ge=2, le=8)
 
     def rgb_model(self) -> RgbModel:
         """Return the RGB camera of this traversal."""
@@ -148,6 +150,11 @@ class QueryPlan(_Model):
             raise DatasetError(
                 f"followed: --blocked and --followed exclude each other ({self.name!r} has both); omit one",
                 field="followed",
+            )
+        if self.cameras is not None and self.sequence is not None:
+            raise DatasetError(
+                f"cameras: {self.name!r} has a sequence already, whose frames one camera takes; omit cameras or sequence",
+                field="cameras",
             )
         sunless = f"whose condition {self.condition!r} has no sun"
         if CONDITIONS[self.condition].sun_strength == 0:

@@ -173,7 +173,7 @@ def test_how_it_works_tells_the_numbers_that_are_set() -> None:
     """Settings change, and so must the page that tells of them."""
     told = " ".join(re.sub(r"<!-- .*? -->", "", (ROOT / "docs" / "how_it_works.md").read_text()).split())
     registration, support = RegistrationSettings(), SupportWeights()
-    words = {3: "three", 4: "four", 5: "five", 6: "six", 8: "eight"}
+    words = {5: "five", 6: "six", 8: "eight", 10: "ten", 11: "eleven"}
     for text in (
         f"Up to {StartSettings().most} hypotheses with {words[len(registration.offsets_m)]} starts each",
         f"a coarse stage of {registration.coarse_points} points",

@@ -10,7 +10,8 @@ def test_there_are_at_least_twelve_families_with_names_of_their_own():
 
 
 def test_the_families_differ_in_survey_depth_and_height():
-    assert {"vlp_16", "hdl_32", "hdl_64", "os1_64", "os1_128", "pandar_64"} == {family.lidar for family in FAMILIES}
+    lidars = {"vlp_16", "hdl_32", "hdl_64", "os1_64", "os1_128", "pandar_64", "livox_mid_360"}
+    assert lidars == {family.lidar for family in FAMILIES}
     assert {1.0, 2.0, 5.0, 10.0} <= {family.spacing_m for family in FAMILIES}
     heights = [family.camera_height_m for family in FAMILIES]
     assert min(heights) <= 0.5
@@ -29,6 +30,12 @@ def test_each_city_of_a_family_is_a_valid_plan_with_half_a_thousand_queries(fami
     assert [plan.queries[-1].sequence for plan in plans] == [None, SEQUENCE]
     assert len({plan.name for plan in plans}) == FAMILY_CITIES
     assert sum(query.count * len(query.depths) for plan in plans for query in plan.queries) >= 500
+
+
+def test_only_single_queries_of_several_cameras_have_several_frames():
+    (family,) = (family for family in FAMILIES if family.cameras > 1)
+    queries = family_plan(family, FAMILY_CITIES - 1).queries
+    assert [query.cameras for query in queries] == [family.cameras] * (len(queries) - 1) + [None]
 
 
 @pytest.mark.parametrize("family", FAMILIES, ids=lambda family: family.name)

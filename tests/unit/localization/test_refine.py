@@ -263,6 +263,12 @@ def test_brightness_decides_between_two_streets_with_equal_depth(bundle_like, cl
     np.testing.assert_allclose(found.best.T_map_camera[:3, 3], TRUE[:3, 3], atol=0.05)
 
 
+#: Registration from the hypotheses themselves, without ray adjustment. Starts around them would find poses ahead by themselves.
+ONE_START = RefineSettings(
+    rays=RaySettings(fewest=10**6), registration=RegistrationSettings(offsets_m=((0.0, 0.0),), turns_rad=())
+)
+
+
 def test_a_noisy_query_triggers_a_local_search_and_moves_to_the_best_brightness(
     bundle_like, cloud, depth, here, seen_in, monkeypatch
 ):
@@ -276,17 +282,16 @@ def test_a_noisy_query_triggers_a_local_search_and_moves_to_the_best_brightness(
     )
     near = [LocalPose(each, 0.5) for each in _shifted(refined(bundle_like(0.4, 0.9), lit, seen_in(depth, here)))]
     monkeypatch.setattr(refining, "search_locally", lambda *_: near)
-    still = RaySettings(fewest=10**6)  # nothing is adjusted
     smooth = replace(
         seen_in(depth, here), noise=5e-3
     )  # errors that near pixels share make no hollows beside the right pose
     noisy = replace(smooth, independent_noise=5e-3)
     found = {}
     for name, frame, settings in (
-        ("noisy", noisy, RefineSettings(rays=still)),
-        ("exact", seen_in(depth, here), RefineSettings(rays=still)),
-        ("smooth", smooth, RefineSettings(rays=still)),
-        ("sure", noisy, RefineSettings(rays=still, near=LocalScoreWeights(stay=1e6))),
+        ("noisy", noisy, ONE_START),
+        ("exact", seen_in(depth, here), ONE_START),
+        ("smooth", smooth, ONE_START),
+        ("sure", noisy, replace(ONE_START, near=LocalScoreWeights(stay=1e6))),
     ):
         near[0] = LocalPose(_registered_by(bundle_like(0.4, 0.9), lit, frame), 0.5)
         found[name] = always_refined(bundle_like(0.4, 0.9), lit, (frame,), None, settings)
@@ -299,9 +304,7 @@ def test_a_noisy_query_triggers_a_local_search_and_moves_to_the_best_brightness(
 
 def _registered_by(bundle, lit, frame):
     """Return the result of registration alone."""
-    return always_refined(
-        bundle, replace(lit, brightness=None), (frame,), None, RefineSettings(rays=RaySettings(fewest=10**6))
-    ).best.registered
+    return always_refined(bundle, replace(lit, brightness=None), (frame,), None, ONE_START).best.registered
 
 
 def _shifted(found):

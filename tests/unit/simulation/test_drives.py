@@ -6,7 +6,7 @@ from model_training.simulation.drives import driven, followed, query_candidates,
 from model_training.simulation.plan import QueryPlan
 from model_training.simulation.traversal import stations, stations_along, survey_error
 from service.errors import DatasetError
-from service.geometry.rigid import heading_of_body, heading_of_camera, inverse
+from service.geometry.rigid import R_BODY_OPTICAL, heading_of_body, heading_of_camera, inverse
 
 
 @pytest.fixture
@@ -187,6 +187,22 @@ def test_the_camera_keeps_its_angles_and_its_height_above_the_ground(city, plan)
     above = [[T[2, 3] - city.height(T[0, 3], T[1, 3]) for T in frames_of_one] for frames_of_one in frames]
     np.testing.assert_allclose(above, np.repeat(np.array(above)[:, 2:], 3, axis=1), atol=1e-9)
     assert np.ptp(frames[:, :, 2, 3], axis=1).max() > 0.05  # it is no plain
+
+
+def test_cameras_around_a_vehicle_look_outwards_from_a_circle(city, plan):
+    query = QueryPlan(name="ring", traversal=1, cameras=4)
+    T = np.eye(4)
+    T[:3, :3], T[:3, 3] = R_BODY_OPTICAL, (10.0, 5.0, 1.5)  # it looks along x
+    ring = followed(city, query, T[None])
+    assert ring.shape == (4, 4, 4)
+    np.testing.assert_allclose(ring[-1], T, atol=1e-12)
+    np.testing.assert_allclose(ring[:, :3, 2], [[0, -1, 0], [-1, 0, 0], [0, 1, 0], [1, 0, 0]], atol=1e-12)
+    np.testing.assert_allclose(ring[:, :3, 3] - [9.5, 5.0, 1.5], 0.5 * ring[:, :3, 2], atol=1e-12)
+
+
+def test_a_ring_of_cameras_has_no_sequence():
+    with pytest.raises(DatasetError, match="cameras: 'ring' has a sequence already"):
+        QueryPlan(name="ring", traversal=1, cameras=4, sequence=3).refuse_what_does_nothing()
 
 
 def test_single_pictures_are_followed_by_themselves(city, plan):

@@ -2,6 +2,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.spatial import cKDTree
 
 from model_training.simulation.conditions import CONDITIONS
 from model_training.simulation.lidar import LIDARS, scan
@@ -137,3 +138,24 @@ def test_extinctions_are_those_of_the_stated_strengths(name, decibel_per_km):
     """25 mm/h: 1.076 * 25^0.67. 2 mm/h of water: 5.50 * 2^1.38. Visibility 50 m: 3.912 / 50 per metre."""
     in_decibel = CONDITIONS[name].extinction_per_m * 1000 * 10 / np.log(10)
     assert in_decibel == pytest.approx(decibel_per_km, rel=0.01)
+
+
+def test_a_non_repetitive_scan_covers_its_field_of_view_evenly():
+    model = LIDARS["livox_mid_360"]
+    rays = model.rays()
+    assert rays.shape == (40 * 1024, 3)
+    np.testing.assert_allclose(np.linalg.norm(rays, axis=1), 1.0, atol=1e-6)
+    elevation_deg = np.rad2deg(np.arcsin(rays[:, 2]))
+    assert -7.01 < elevation_deg.min() < -6.9 < 51.9 < elevation_deg.max() < 52.01
+    azimuth_deg = np.rad2deg(np.arctan2(rays[:, 1], rays[:, 0]))
+    cells, *_ = np.histogram2d(azimuth_deg, elevation_deg, [12, 6], [(-180, 180), (-7, 52)])
+    assert cells.min() > 0.95 * cells.mean()
+    assert cells.max() < 1.05 * cells.mean()
+
+
+def test_two_non_repetitive_scans_have_other_points(wall):
+    model = replace(MODEL, non_repetitive=True, range_noise_m=0.0)
+    first, second = (scan_of(wall, model, seed=seed) for seed in (0, 1))
+    distance, _ = cKDTree(first[:, :3]).query(second[:, :3])
+    assert np.median(distance) > 0.01
+    np.testing.assert_allclose(second[:, 0], first[0, 0], atol=1e-3)  # the same wall

@@ -17,8 +17,8 @@ from model_training.simulation.stereo_pair import STEREOS, StereoModel
 from model_training.simulation.survey_drive import SurveyModel
 from service.errors import DatasetError
 
-#: What only a preset says: its name, a table of beams, a matcher.
-NOT_NUMBERS = {"name", "beams_deg", "matching", "response"}
+#: What only a preset says: its name, a table of beams, a scan pattern, a matcher.
+NOT_NUMBERS = {"name", "beams_deg", "non_repetitive", "matching", "response"}
 FORMATS = Path(__file__).parents[3] / "docs" / "formats.md"
 
 
