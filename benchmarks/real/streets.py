@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from benchmarks.real.confidence import confidence_rows, pooled_confidence_rows
 from benchmarks.real.peers import peer_rows, pooled_rows
 from benchmarks.report import Report
 from model_training.datasets.dataset import Dataset
@@ -65,16 +66,18 @@ def street_rows(report: Report, data: Path, work: Path, drives: tuple[str, ...] 
         drives: names of the drives.
     """
     streets = [street for name in drives if (street := _street(report, data, work, name)) is not None]
-    others = []
+    others, calibrated = [], []
     for street in streets:
         found = predict(street.localizer, street.dataset, QUERIES)
         answer_rows(report, f"real.{street.name}", found)
         _stage_rows(report, street)
         others.append(peer_rows(report, street.name, street.dataset, street.localizer, QUERIES))
         track_rows(report, street.name, street.dataset, street.localizer)
+        calibrated.append(confidence_rows(report, street.name, street.dataset, street.localizer, QUERIES))
         if street.name == "kitti_0013":
             sequence_rows(report, street.name, street.dataset, street.localizer)
     pooled_rows(report, others)
+    pooled_confidence_rows(report, calibrated)
     accepted = [
         predict(own.localizer, other.dataset, QUERIES).localized
         for own in streets

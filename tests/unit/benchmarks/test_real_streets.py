@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from benchmarks.real.confidence import CalibrationErrors, pooled_confidence_rows
 from benchmarks.real.peers import pooled_rows
 from benchmarks.real.streets import answer_rows, status_rows
 from benchmarks.real.variants import PRIOR_M, EveryScan, grey, prior_at
@@ -89,3 +90,19 @@ def test_drives_are_pooled_by_their_queries_and_ours_must_be_higher(tmp_path):
     assert rows["real.peers.ours_within_1_m"]["holds"] is False
     pooled_rows(report, [(0.5, 0.9, 10)])
     assert rows_of(report)["real.peers.ours_within_1_m"]["holds"] is True
+
+
+def test_calibration_errors_are_pooled_by_the_queries_of_each_drive(tmp_path):
+    report = Report("x", "x", folder=tmp_path)
+    pooled_confidence_rows(report, [CalibrationErrors(10, 0.2, 0.1), CalibrationErrors(30, 0.04, 0.02)])
+    rows = rows_of(report)
+    assert rows["real.ece"]["value"] == pytest.approx(0.08)
+    assert rows["real.ece"]["n"] == 40
+    assert rows["real.ece_after_rig_calibration"]["value"] == pytest.approx(0.04)
+    assert [row["holds"] for row in rows.values()] == [True, True]
+
+
+def test_without_a_drive_there_are_no_calibration_errors(tmp_path):
+    report = Report("x", "x", folder=tmp_path)
+    pooled_confidence_rows(report, [])
+    assert report.rows == []
