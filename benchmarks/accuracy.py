@@ -20,6 +20,7 @@ from benchmarks.plans import BOTH, large_plan, paper_plan, unseen_plan
 from benchmarks.priors import prior_rows
 from benchmarks.raw import raw_condition_rows, raw_paper_rows, raw_rows, raw_unseen_rows
 from benchmarks.report import ROOT, Report
+from benchmarks.rig_calibration import rig_calibration_rows
 from benchmarks.rigs import rig_rows
 from benchmarks.runs import Runs, share
 from benchmarks.sequences import sequence_rows
@@ -190,6 +191,7 @@ def main() -> None:
         "priors": lambda: prior_rows(report, runs),
         "heights": lambda: height_rows(report, runs),
         "rigs": lambda: rig_rows(report, arguments.encoder, arguments.calibration_work),
+        "rig_calibration": lambda: rig_calibration_rows(report, runs),
         "unseen": lambda: unseen_rows(report, runs),
         "large": lambda: large_rows(report, runs),
         "paper": lambda: paper_rows(report, runs, "retrieval", barred=True),
