@@ -153,8 +153,8 @@ def refine(
     heading = heading_of_camera(candidates[0].T_map_camera)
     of_registration = covariance_of(best.information, scatter, noise, heading, model)
     systematic = survey_covariance(*bundle.manifest.survey_std)
-    if rig_px_m is not None:
-        systematic = systematic + rectification_covariance()
+    if reference.query.baseline_m is not None:
+        systematic = systematic + rectification_covariance(reference.views.height_m, reference.query.baseline_m)
     candidates[0] = replace(candidates[0], covariance=of_registration + systematic)
 
     def covariance_at(candidate: Candidate) -> Float64[NDArray[np.float64], "6 6"]:

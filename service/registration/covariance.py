@@ -89,17 +89,26 @@ def survey_covariance(position_std_m: float | None, angle_std_deg: float | None)
     return np.diag([position] * 3 + [angle] * 3)
 
 
-#: Standard deviation of roll and pitch from the rectification of a stereo pair, degrees. Rows or a roll that are off by half a pixel tilt
-#: the disparity plane, and a pair cannot show it. Measured on stereo rigs of the calibration and on KITTI drive 0005 (decision 0151).
-RECTIFICATION_DEG = 0.2
+#: Standard deviation of roll and pitch from the rectification of a stereo pair, degrees, at a height that equals the baseline. A right
+#: camera that is rolled against the left one tilts the disparity plane, and a pair cannot show it. On the ground plane, inverse depth is
+#: proportional to 1 / height and disparity to the baseline, so the tilt is proportional to height over baseline. Measured on five stereo
+#: rigs of the calibration and on KITTI drive 0005 (decisions 0151 and 0157).
+RECTIFICATION_DEG = 0.065
+#: Largest standard deviation of this tilt, degrees.
+_MOST_TILT_DEG = 3.0
 
 
-def rectification_covariance() -> Float64[NDArray[np.float64], "6 6"]:
+def rectification_covariance(height_m: float, baseline_m: float) -> Float64[NDArray[np.float64], "6 6"]:
     """Return the covariance that the rectification of a stereo pair adds: translation (m), then rotation (rad).
 
     Roll and pitch get the same variance, so it holds for every heading.
+
+    Args:
+        height_m: height of the camera above the ground, metres.
+        baseline_m: baseline of the stereo pair, metres.
     """
-    return np.diag(np.deg2rad([0, 0, 0, RECTIFICATION_DEG, RECTIFICATION_DEG, 0]) ** 2)
+    tilt_deg = min(RECTIFICATION_DEG * height_m / baseline_m, _MOST_TILT_DEG)
+    return np.diag(np.deg2rad([0, 0, 0, tilt_deg, tilt_deg, 0]) ** 2)
 
 
 def covariance_of(

@@ -221,7 +221,12 @@ def test_a_poor_survey_adds_the_excess_of_its_variance():
     np.testing.assert_array_equal(found, np.diag(np.diag(found)))
 
 
-def test_the_rectification_of_a_stereo_pair_tilts_the_pose():
-    found = covariance.rectification_covariance()
-    tilt = np.deg2rad(covariance.RECTIFICATION_DEG)
+@pytest.mark.parametrize(
+    ("height_m", "baseline_m", "tilt_deg"),
+    [(1.0, 1.0, 0.065), (1.65, 0.55, 0.195), (0.9, 0.06, 0.975), (4.0, 0.01, 3.0)],
+)
+def test_the_rectification_of_a_stereo_pair_tilts_the_pose(height_m, baseline_m, tilt_deg):
+    """0.065 degrees times height over baseline, at most 3 degrees."""
+    found = covariance.rectification_covariance(height_m, baseline_m)
+    tilt = np.deg2rad(tilt_deg)
     np.testing.assert_allclose(np.sqrt(np.diag(found)), [0, 0, 0, tilt, tilt, 0])
