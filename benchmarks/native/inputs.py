@@ -206,7 +206,7 @@ def _align(rng: np.random.Generator, cloud: SurfelMap) -> list[NDArray[Any]]:
         patch = (np.arange(len(points)) // 7).astype(np.int32)
         found.append(gradients(cloud.grid, cloud.surfels, points, states[:1], OPTIONS, patch))
         del state
-    return [*found, cloud.grid.block, cloud.grid.nearest]
+    return [*found, cloud.grid.slots, cloud.grid.regions, cloud.grid.blocks, cloud.grid.nearest]
 
 
 def _render(rng: np.random.Generator, cloud: SurfelMap, height: int, width: int) -> list[NDArray[Any]]:

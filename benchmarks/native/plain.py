@@ -8,7 +8,7 @@ from service.geometry.rigid import Rotation, Transform
 from service.imaging import level
 from service.imaging.gather import FEWEST_SAMPLES, _sub_rays
 from service.imaging.view_grid import ViewGrid
-from service.registration.kernel import BLOCK, NearestGrid, QueryPoints, SolverOptions
+from service.registration.kernel import BLOCK, KEY_BITS, REGION, NearestGrid, QueryPoints, SolverOptions
 from service.registration.points import LEAST_NOISE, NOISE_ROWS, NOISE_STEPS, PointSettings
 from service.registration.rays import RayPicture, RaySettings
 from service.registration.visibility import DiscSettings
@@ -141,6 +141,29 @@ def noise_of(depth_m: NDArray[np.float32]) -> float:
     return max(1.4826 * max(medians) / 6**0.5, LEAST_NOISE)
 
 
+def surfels_of_cells(grid: NearestGrid, cells: NDArray[np.int64]) -> NDArray[np.int32]:
+    """Return the surfel of each cell of a lookup grid as ``NearestGrid.surfels_at`` does; -1 for none.
+
+    Args:
+        grid: lookup grid of the map, with at least one region.
+        cells: numbers of the cells along x, y and z, (..., 3).
+    """
+    region, block, cell = cells // (REGION * BLOCK), cells // BLOCK % REGION, cells % BLOCK
+    inside = ((region >= 0) & (region < 1 << KEY_BITS)).all(axis=-1)
+    key = np.where(inside, region @ [1 << 2 * KEY_BITS, 1 << KEY_BITS, 1], 0)
+    at = np.minimum(np.searchsorted(grid.regions["key"], key), len(grid.regions) - 1)
+    row = grid.regions["row"][at, block @ [REGION * REGION, REGION, 1]].astype(np.int64)
+    inside &= (grid.regions["key"][at] == key) & (row > 0)
+    found = grid.blocks[np.where(inside, grid.regions["first"][at] + row - 1, 0)]
+    part = np.asarray(cell // 4 @ [4, 2, 1], np.int64)[..., None]
+    bit = (cell % 4 @ [16, 4, 1]).astype(np.uint64)
+    filled = np.take_along_axis(found["filled"], part, axis=-1)[..., 0]
+    inside &= (filled >> bit & np.uint64(1)) > 0
+    before = np.take_along_axis(found["before"], part, axis=-1)[..., 0]
+    entry = found["first"] + before + np.bitwise_count(filled & ((np.uint64(1) << bit) - np.uint64(1)))
+    return np.asarray(np.where(inside, grid.nearest[np.where(inside, entry, 0)], -1))
+
+
 def information(
     grid: NearestGrid, surfels: NDArray[np.void], points: QueryPoints, states: NDArray[np.void], options: SolverOptions
 ) -> tuple[Floats, Floats]:
@@ -162,11 +185,8 @@ def information(
     y = (stretch[..., None] * points.xyz) @ R.transpose(0, 2, 1)
     at = y + states["t"][:, None]
     cell = np.floor((at - grid.origin_m) / grid.cell_m).astype(np.int64)
-    inside = (cell >= 0).all(axis=2) & (cell < np.array(grid.block.shape) * BLOCK).all(axis=2)
-    cell = np.where(inside[..., None], cell, 0)
-    block = grid.block[tuple(np.moveaxis(cell // BLOCK, 2, 0))]
-    found = grid.nearest[np.maximum(block, 0), cell % BLOCK @ [BLOCK * BLOCK, BLOCK, 1]]
-    use = inside & (block >= 0) & (found >= 0)
+    found = surfels_of_cells(grid, cell)
+    use = found >= 0
     near = surfels[np.maximum(found, 0)]
     normal, off = near["normal"].astype(f64), at - near["xyz"]
     use &= (off**2).sum(axis=2) <= options.reach**2

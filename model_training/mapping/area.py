@@ -5,7 +5,6 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 import shapely
 from numpy.typing import NDArray
@@ -22,13 +21,17 @@ CELL_M = 2.0
 COVERED_M = 25.0
 #: Radius around a place that always counts as covered, metres. The vehicle hides the ground there.
 _OWN_M = 4.0
+#: Bits of a cell's number along each axis, in its key. Cells up to 1 million km from the origin have keys of their own.
+_KEY_BITS = 30
+#: Steps from a cell to itself and to its eight neighbours.
+_AROUND = np.stack(np.meshgrid([-1, 0, 1], [-1, 0, 1]), axis=-1).reshape(-1, 2)
 
 
 def covered_by(points: NDArray[np.float64], places: NDArray[np.float64]) -> Area:
     """Return the area that a traversal covered: the cells of the ground plan with points.
 
     Gaps of one or two cells are filled. Ground without new points is not covered and stays in the map, for example behind a new wall or
-    inside a block.
+    inside a block. Only covered cells take memory.
 
     Args:
         points: means of the traversal's voxels, metres, map frame, (n, 2) or (n, 3).
@@ -37,21 +40,28 @@ def covered_by(points: NDArray[np.float64], places: NDArray[np.float64]) -> Area
     track = cKDTree(places[:, :2])
     near = points[track.query(points[:, :2], distance_upper_bound=COVERED_M)[0] < np.inf, :2]
     seen = np.concatenate([near, places[:, :2]])
-    corner = np.floor(seen.min(axis=0) / CELL_M).astype(np.int64) - 4
-    shape = np.floor(seen.max(axis=0) / CELL_M).astype(np.int64) - corner + 5
-    plan = np.zeros(shape, np.uint8)
-    cell = np.floor(seen / CELL_M).astype(np.int64) - corner
-    plan[cell[:, 0], cell[:, 1]] = 1
-    plan = cv2.morphologyEx(plan, cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8)).astype(np.uint8)
+    covered = _closed(np.unique(_keys(np.floor(seen / CELL_M).astype(np.int64))))
 
     def inside(xy: NDArray[np.float64]) -> NDArray[np.bool_]:
-        at = np.floor(xy[:, :2] / CELL_M).astype(np.int64) - corner
-        on_plan = ((at >= 0) & (at < shape)).all(axis=1)
-        at[~on_plan] = 0
         own = track.query(xy[:, :2], distance_upper_bound=_OWN_M)[0] < np.inf
-        return np.asarray(own | (on_plan & (plan[at[:, 0], at[:, 1]] > 0)))
+        return np.asarray(own | np.isin(_keys(np.floor(xy[:, :2] / CELL_M).astype(np.int64)), covered))
 
     return inside
+
+
+def _keys(cells: NDArray[np.int64]) -> NDArray[np.int64]:
+    return np.asarray((cells[..., 0] << _KEY_BITS) + cells[..., 1])
+
+
+def _closed(keys: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Close a set of cells with a square of 3 x 3 cells (dilation, then erosion); return the keys, ascending.
+
+    Args:
+        keys: keys of the cells, ascending, each once (n,).
+    """
+    steps = _keys(_AROUND)
+    dilated = np.unique(keys[:, None] + steps)
+    return np.asarray(dilated[np.isin(dilated[:, None] + steps, dilated).all(axis=1)])
 
 
 def polygon_of(path: Path) -> Area:

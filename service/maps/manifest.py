@@ -13,7 +13,7 @@ from service.geometry.earth import Georeference
 from service.imaging.view_grid import ViewGrid
 
 #: Version of the bundle format that this program reads and writes.
-FORMAT = 3
+FORMAT = 4
 FILE = "manifest.json"
 #: File of a dataset folder. Users confuse the two kinds of folders.
 DATASET_FILE = "dataset.json"
@@ -103,7 +103,7 @@ class Manifest(_Frozen):
         tool_versions: version of each tool that built the map, by name.
     """
 
-    format: Literal[3]
+    format: Literal[4]
     name: Name
     version: Annotated[str, Field(pattern=r"^[0-9a-f]{16}$")]
     made_at: AwareDatetime

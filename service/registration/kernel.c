@@ -12,14 +12,36 @@
 #include "wide.h"
 
 #define UNKNOWNS 8
-#define BLOCK 8
-#define BLOCK_CELLS (BLOCK * BLOCK * BLOCK)
+#define BLOCK 8       /* cells along the edge of a block */
+#define PART 4        /* cells along the edge of a part; a block has 2 x 2 x 2 parts */
+#define PARTS 8
+#define PART_CELLS 64 /* one bit of a uint64_t for each */
+#define REGION 8      /* blocks along the edge of a region */
+#define REGION_BLOCKS (REGION * REGION * REGION)
+#define REGION_EDGE (REGION * BLOCK) /* cells along the edge of a region */
+#define KEY_BITS 18   /* bits of a region's number along each axis */
+
+/* A block with at least one filled cell. A filled cell has a surfel in reach of its centre. */
+typedef struct {
+    uint64_t filled[PARTS]; /* bit (x * 4 + y) * 4 + z of a part: the cell is filled */
+    int64_t first;          /* entry of the block's first filled cell in nearest */
+    uint16_t before[PARTS]; /* number of filled cells in the parts before each part */
+} Block;
+
+/* A region with at least one block. */
+typedef struct {
+    int64_t key;                /* numbers of the region along x, y, z: (x << 36) + (y << 18) + z */
+    int64_t first;              /* row of the region's first block in blocks */
+    uint16_t row[REGION_BLOCKS]; /* row of each block, counted from first, plus 1; 0 for none */
+} Region;
 
 typedef struct {
-    double ox, oy, oz, cell;     /* corner of the grid and edge of a cell, m */
-    int64_t bx, by, bz;          /* number of blocks along each axis */
-    const int32_t *block;        /* (bx, by, bz): row of each block in nearest, -1 for none */
-    const int32_t *nearest;      /* (blocks, 512): index of the surfel nearest to the cell's centre, -1 for none */
+    double ox, oy, oz, cell; /* corner of the grid and edge of a cell, m */
+    int64_t slot_bits;       /* binary logarithm of the number of slots */
+    const int32_t *slots;    /* hash table with linear probing: row of a region in regions, -1 for none */
+    const Region *regions;
+    const Block *blocks;
+    const int32_t *nearest;  /* of each filled cell: index of the surfel nearest to its centre */
 } Grid;
 
 /* Each array is padded with zeros to whole batches (BATCH_SIZE). */
@@ -112,12 +134,101 @@ typedef struct {
     double gradient[UNKNOWNS][BATCH_SIZE], r[BATCH_SIZE], w[BATCH_SIZE], matched[BATCH_SIZE];
 } Batch;
 
+/* The regions that a query has touched, so that few points search the hash table. Two regions share an entry if they are 8 regions apart. */
+#define RECENT 8
+typedef struct {
+    int64_t key[RECENT * RECENT * RECENT];
+    const Region *region[RECENT * RECENT * RECENT]; /* EMPTY_REGION if the grid has no such region */
+} Recent;
+
+static inline void forget(Recent *recent)
+{
+    for (int i = 0; i < RECENT * RECENT * RECENT; i++) recent->key[i] = -1;
+}
+
+/* Slot at which the search for a region begins: Fibonacci hashing (Knuth, The Art of Computer Programming 3, section 6.4). */
+static inline int64_t first_slot(int64_t key, int64_t slot_bits)
+{
+    return (int64_t)(((uint64_t)key * 0x9E3779B97F4A7C15u) >> (64 - slot_bits));
+}
+
+static const Region EMPTY_REGION;
+static const Block EMPTY_BLOCK;
+
+static inline const Region *find_region(const Grid *g, int64_t key)
+{
+    const int64_t last = ((int64_t)1 << g->slot_bits) - 1;
+    int64_t slot = first_slot(key, g->slot_bits);
+    for (int64_t tried = 0; tried <= last; tried++) {
+        const int32_t row = g->slots[slot];
+        if (row < 0) return &EMPTY_REGION;
+        if (g->regions[row].key == key) return g->regions + row;
+        slot = (slot + 1) & last;
+    }
+    return &EMPTY_REGION;
+}
+
+static inline int64_t key_of(int64_t x, int64_t y, int64_t z)
+{
+    return (x << 2 * KEY_BITS) + (y << KEY_BITS) + z;
+}
+
+/* Finds the entries in ``nearest`` of the cells that hold some points: ``at`` (3, BATCH_SIZE), surfels' frame, m. 0 for a cell that is not
+ * filled. */
+static inline void find_cells(const Grid *g, double at[3][BATCH_SIZE], int64_t count, Recent *recent, const int32_t **cells)
+{
+    int32_t in[3][BATCH_SIZE], recent_entry[BATCH_SIZE], number[BATCH_SIZE], part[BATCH_SIZE], bit[BATCH_SIZE];
+    int64_t keys[BATCH_SIZE];
+    const Region *regions[BATCH_SIZE];
+    const Block *blocks[BATCH_SIZE];
+    /* For values >= 0 truncation equals floor(), which is a slow call on plain x86-64 (decision 0025). Values outside the numbered regions
+     * and NaN become -1, which is no cell. */
+    const double origin[3] = {g->ox, g->oy, g->oz}, scale = 1.0 / g->cell;
+    for (int a = 0; a < 3; a++)
+        for (int k = 0; k < BATCH_SIZE; k++) {
+            double cell = (at[a][k] - origin[a]) * scale;
+            cell = cell >= 0 ? cell : -1.0;
+            cell = cell < (double)(REGION_EDGE << KEY_BITS) ? cell : -1.0;
+            in[a][k] = (int32_t)cell;
+        }
+    for (int k = 0; k < BATCH_SIZE; k++) {
+        const uint32_t outside = (uint32_t)((in[0][k] | in[1][k] | in[2][k]) >> 31);
+        const uint32_t x = (uint32_t)in[0][k] | outside, y = (uint32_t)in[1][k] | outside, z = (uint32_t)in[2][k] | outside;
+        const uint32_t i = x / REGION_EDGE, j = y / REGION_EDGE, l = z / REGION_EDGE;
+        keys[k] = key_of(i, j, l); /* a position outside has a key that no region has */
+        recent_entry[k] = (int32_t)((i % RECENT * RECENT + j % RECENT) * RECENT + l % RECENT);
+        number[k] = (int32_t)((x / BLOCK % REGION * REGION + y / BLOCK % REGION) * REGION + z / BLOCK % REGION);
+        part[k] = (int32_t)((x / PART % 2 * 2 + y / PART % 2) * 2 + z / PART % 2);
+        bit[k] = (int32_t)((x % PART * PART + y % PART) * PART + z % PART);
+    }
+    /* Each loop fetches the memory of the next one, and hardly any branches: whether a cell is filled cannot be predicted. */
+    for (int64_t k = 0; k < count; k++) {
+        const int32_t entry = recent_entry[k];
+        if (recent->key[entry] != keys[k]) {
+            recent->region[entry] = find_region(g, keys[k]);
+            recent->key[entry] = keys[k];
+        }
+        regions[k] = recent->region[entry];
+    }
+    for (int64_t k = 0; k < count; k++) {
+        const int64_t row = regions[k]->row[number[k]];
+        blocks[k] = row ? g->blocks + regions[k]->first + row - 1 : &EMPTY_BLOCK;
+        __builtin_prefetch(blocks[k]->filled + part[k]);
+        __builtin_prefetch(&blocks[k]->first);
+    }
+    for (int64_t k = 0; k < count; k++) {
+        const uint64_t filled = blocks[k]->filled[part[k]], cell = (uint64_t)1 << bit[k];
+        const int32_t *entry = g->nearest + blocks[k]->first + blocks[k]->before[part[k]] + __builtin_popcountll(filled & (cell - 1));
+        __builtin_prefetch(entry);
+        cells[k] = filled & cell ? entry : 0;
+    }
+}
+
 /* Positions of the points first .. first + count - 1 in the surfels' frame, and their nearest surfels. */
 static inline void find_surfels(const Grid *g, const Surfel *surfels, const Query *q, const State *s, double e_scale, int64_t first,
-                                int64_t count, Batch *b)
+                                int64_t count, Recent *recent, Batch *b)
 {
     const int32_t *cells[BATCH_SIZE];
-    int32_t in[3][BATCH_SIZE];
     for (int k = 0; k < BATCH_SIZE; k++) b->stretch[k] = e_scale / (1.0 + s->offset * q->q[first + k]);
     for (int k = 0; k < BATCH_SIZE; k++) {
         const double px = b->stretch[k] * q->xyz[0][first + k], py = b->stretch[k] * q->xyz[1][first + k];
@@ -127,28 +238,9 @@ static inline void find_surfels(const Grid *g, const Surfel *surfels, const Quer
             b->at[a][k] = b->y[a][k] + s->t[a];
         }
     }
-    /* For values >= 0 truncation equals floor(), which is a slow call on plain x86-64 (decision 0025). Values outside the grid and NaN
-     * become -2, which is no cell. */
-    const double origin[3] = {g->ox, g->oy, g->oz}, scale = 1.0 / g->cell;
-    for (int a = 0; a < 3; a++)
-        for (int k = 0; k < BATCH_SIZE; k++) {
-            double cell = (b->at[a][k] - origin[a]) * scale;
-            cell = cell >= 0 ? cell : -2.0;
-            cell = cell < 1e9 ? cell : -2.0;
-            in[a][k] = (int32_t)cell;
-        }
+    find_cells(g, b->at, count, recent, cells);
     for (int64_t k = 0; k < count; k++) {
-        const int32_t ix = in[0][k], iy = in[1][k], iz = in[2][k];
-        const int64_t i = ix / BLOCK, j = iy / BLOCK, l = iz / BLOCK;
-        cells[k] = 0;
-        if ((ix | iy | iz) < 0 || i >= g->bx || j >= g->by || l >= g->bz) continue;
-        const int32_t block = g->block[(i * g->by + j) * g->bz + l];
-        if (block < 0) continue;
-        cells[k] = g->nearest + (int64_t)block * BLOCK_CELLS + ((ix % BLOCK) * BLOCK + iy % BLOCK) * BLOCK + iz % BLOCK;
-        __builtin_prefetch(cells[k]);
-    }
-    for (int64_t k = 0; k < count; k++) {
-        b->surfel[k] = cells[k] && *cells[k] >= 0 ? surfels + *cells[k] : 0;
+        b->surfel[k] = cells[k] ? surfels + *cells[k] : 0;
         if (b->surfel[k]) __builtin_prefetch(b->surfel[k]);
     }
     for (int64_t k = count; k < BATCH_SIZE; k++) b->surfel[k] = 0;
@@ -250,7 +342,7 @@ static inline void add_products(const double *one, const double *other, double *
     for (int l = 0; l < LANES; l++) sums[l] += own[l];
 }
 
-static inline void align_one(const Grid *g, const Surfel *surfels, const Query *q, const Options *o, State *s)
+static inline void align_one(const Grid *g, const Surfel *surfels, const Query *q, const Options *o, Recent *recent, State *s)
 {
     Batch batch;
     double total_weight = 0;
@@ -262,7 +354,7 @@ static inline void align_one(const Grid *g, const Surfel *surfels, const Query *
         double sums[UNKNOWNS][UNKNOWNS + 1][LANES] = {{{0}}}, e_scale = exp(s->log_scale), total = 0, squares = 0;
         for (int64_t first = 0; first < q->count; first += BATCH_SIZE) {
             const int64_t left = q->count - first, count = left < BATCH_SIZE ? left : BATCH_SIZE;
-            find_surfels(g, surfels, q, s, e_scale, first, count, &batch);
+            find_surfels(g, surfels, q, s, e_scale, first, count, recent, &batch);
             linearise(q, o, s, robust, e_scale, first, &batch);
             for (int a = 0; a < UNKNOWNS; a++) {
                 double weighted[BATCH_SIZE];
@@ -301,13 +393,14 @@ static inline void align_one(const Grid *g, const Surfel *surfels, const Query *
 
 /* Share of the points on the map. Precise points weigh more. A point counts by exp(-r^2 / (2 variance)) of its distance r to the surface,
  * not by a hard threshold. */
-static inline void score_one(const Grid *g, const Surfel *surfels, const Query *q, double tolerance, double height_min, State *s)
+static inline void score_one(const Grid *g, const Surfel *surfels, const Query *q, double tolerance, double height_min, Recent *recent,
+                             State *s)
 {
     Batch batch;
     double inliers = 0, total = 0, e_scale = exp(s->log_scale);
     for (int64_t first = 0; first < q->count; first += BATCH_SIZE) {
         const int64_t left = q->count - first, count = left < BATCH_SIZE ? left : BATCH_SIZE;
-        find_surfels(g, surfels, q, s, e_scale, first, count, &batch);
+        find_surfels(g, surfels, q, s, e_scale, first, count, recent, &batch);
         for (int64_t k = 0; k < count; k++) {
             const int64_t i = first + k;
             double sigma = q->sigma[i];
@@ -332,9 +425,11 @@ static inline void score_one(const Grid *g, const Surfel *surfels, const Query *
 WIDE void streetfix_align(const Grid *g, const Surfel *surfels, const Query *q, const Options *o, double tolerance, double height_min,
                           int64_t count, State *states)
 {
+    Recent recent;
+    forget(&recent);
     for (int64_t k = 0; k < count; k++) {
-        if (o->iterations > 0) align_one(g, surfels, q, o, states + k);
-        score_one(g, surfels, q, tolerance, height_min, states + k);
+        if (o->iterations > 0) align_one(g, surfels, q, o, &recent, states + k);
+        score_one(g, surfels, q, tolerance, height_min, &recent, states + k);
     }
 }
 
@@ -343,45 +438,54 @@ void streetfix_gradients(const Grid *g, const Surfel *surfels, const Query *q, c
                          double *gradients)
 {
     Batch batch;
+    Recent recent;
+    forget(&recent);
     const double e_scale = exp(s->log_scale);
     for (int64_t first = 0; first < q->count; first += BATCH_SIZE) {
         const int64_t left = q->count - first, count = left < BATCH_SIZE ? left : BATCH_SIZE;
-        find_surfels(g, surfels, q, s, e_scale, first, count, &batch);
+        find_surfels(g, surfels, q, s, e_scale, first, count, &recent, &batch);
         linearise(q, o, s, o->robust_last, e_scale, first, &batch);
         for (int64_t k = 0; k < count; k++)
             for (int a = 0; a < UNKNOWNS; a++) gradients[UNKNOWNS * patch[first + k] + a] += batch.w[k] * batch.r[k] * batch.gradient[a][k];
     }
 }
 
-/* Sets ``mark`` (bx, by, bz) to 1 for all blocks that the cube of +-``reach`` around a surfel touches. */
-void streetfix_mark_blocks(const Grid *g, const Surfel *surfels, int64_t count, double reach, uint8_t *mark)
+/* Writes to ``found`` the index of the surfel that the grid holds for each position (count, 3), surfels' frame, m; -1 for none. */
+WIDE void streetfix_lookup(const Grid *g, const double *positions, int64_t count, int32_t *found)
 {
-    double edge = g->cell * BLOCK;
-    for (int64_t i = 0; i < count; i++) {
-        const float *p = surfels[i].xyz;
-        const double o[3] = {g->ox, g->oy, g->oz};
-        int64_t low[3], high[3];
-        for (int k = 0; k < 3; k++) {
-            low[k] = (int64_t)floor((p[k] - reach - o[k]) / edge);
-            high[k] = (int64_t)floor((p[k] + reach - o[k]) / edge);
-        }
-        for (int64_t a = low[0]; a <= high[0]; a++)
-            for (int64_t b = low[1]; b <= high[1]; b++)
-                for (int64_t c = low[2]; c <= high[2]; c++) mark[(a * g->by + b) * g->bz + c] = 1;
+    Recent recent;
+    forget(&recent);
+    for (int64_t first = 0; first < count; first += BATCH_SIZE) {
+        const int64_t left = count - first, some = left < BATCH_SIZE ? left : BATCH_SIZE;
+        double at[3][BATCH_SIZE] = {{0}};
+        const int32_t *cells[BATCH_SIZE];
+        for (int64_t k = 0; k < some; k++)
+            for (int a = 0; a < 3; a++) at[a][k] = positions[3 * (first + k) + a];
+        find_cells(g, at, some, &recent, cells);
+        for (int64_t k = 0; k < some; k++) found[first + k] = cells[k] ? *cells[k] : -1;
     }
 }
 
-/* Writes to ``nearest`` the index of the surfel nearest to each cell's centre within reach, and to ``distance2`` its squared distance. The
- * caller sets ``nearest`` to -1 and ``distance2`` to a large value. */
-void streetfix_fill_grid(const Grid *g, const Surfel *surfels, int64_t count, double reach, int32_t *nearest, float *distance2)
+/* Builds one region; its key is set. ``which`` (count): indices of the surfels whose reach may touch the region, ascending. Work memory for
+ * all cells of the region: ``surfel_of`` and ``distance2``. Writes the row of each block to the region, the filled blocks to ``blocks``, and
+ * the surfels of their filled cells to ``nearest``. The field ``first`` of a block counts from the start of ``nearest``. Returns the number
+ * of blocks. */
+int64_t streetfix_build_region(const Grid *g, const Surfel *surfels, const int32_t *which, int64_t count, double reach, int32_t *surfel_of,
+                               float *distance2, Region *region, Block *blocks, int32_t *nearest)
 {
     const double o[3] = {g->ox, g->oy, g->oz};
+    const int64_t mask = ((int64_t)1 << KEY_BITS) - 1;
+    const int64_t corner[3] = {REGION_EDGE * (region->key >> 2 * KEY_BITS), REGION_EDGE * (region->key >> KEY_BITS & mask),
+                               REGION_EDGE * (region->key & mask)};
+    for (int64_t i = 0; i < REGION_EDGE * REGION_EDGE * REGION_EDGE; i++) surfel_of[i] = -1, distance2[i] = INFINITY;
     for (int64_t i = 0; i < count; i++) {
-        const float *p = surfels[i].xyz;
+        const float *p = surfels[which[i]].xyz;
         int64_t low[3], high[3];
         for (int k = 0; k < 3; k++) {
             low[k] = (int64_t)ceil((p[k] - reach - o[k]) / g->cell - 0.5);
             high[k] = (int64_t)floor((p[k] + reach - o[k]) / g->cell - 0.5);
+            low[k] = low[k] > corner[k] ? low[k] : corner[k];
+            high[k] = high[k] < corner[k] + REGION_EDGE - 1 ? high[k] : corner[k] + REGION_EDGE - 1;
         }
         for (int64_t x = low[0]; x <= high[0]; x++)
             for (int64_t y = low[1]; y <= high[1]; y++)
@@ -390,13 +494,43 @@ void streetfix_fill_grid(const Grid *g, const Surfel *surfels, int64_t count, do
                     double dz = o[2] + (z + 0.5) * g->cell - p[2];
                     float d2 = (float)(dx * dx + dy * dy + dz * dz);
                     if (d2 > reach * reach) continue;
-                    int32_t block = g->block[((x / BLOCK) * g->by + y / BLOCK) * g->bz + z / BLOCK];
-                    int64_t at = (int64_t)block * BLOCK_CELLS + ((x % BLOCK) * BLOCK + y % BLOCK) * BLOCK + z % BLOCK;
+                    const int64_t at = ((x - corner[0]) * REGION_EDGE + y - corner[1]) * REGION_EDGE + z - corner[2];
                     if (d2 < distance2[at]) {
                         distance2[at] = d2;
-                        nearest[at] = (int32_t)i;
+                        surfel_of[at] = which[i];
                     }
                 }
+    }
+    int64_t found = 0, cells = 0;
+    for (int64_t number = 0; number < REGION_BLOCKS; number++) {
+        const int64_t i = number / (REGION * REGION), j = number / REGION % REGION, l = number % REGION;
+        Block block = {.first = cells};
+        for (int part = 0; part < PARTS; part++) {
+            block.before[part] = (uint16_t)(cells - block.first);
+            for (int cell = 0; cell < PART_CELLS; cell++) {
+                const int64_t x = i * BLOCK + part / 4 * PART + cell / (PART * PART);
+                const int64_t y = j * BLOCK + part / 2 % 2 * PART + cell / PART % PART, z = l * BLOCK + part % 2 * PART + cell % PART;
+                const int32_t surfel = surfel_of[(x * REGION_EDGE + y) * REGION_EDGE + z];
+                if (surfel < 0) continue;
+                block.filled[part] |= (uint64_t)1 << cell;
+                nearest[cells++] = surfel;
+            }
+        }
+        region->row[number] = cells > block.first ? (uint16_t)(found + 1) : 0;
+        if (cells > block.first) blocks[found++] = block;
+    }
+    return found;
+}
+
+/* Fills the hash table: ``slots`` (2 to the power of ``slot_bits``) for ``count`` regions. The caller sets it to -1, and it has more slots
+ * than regions. */
+void streetfix_fill_slots(const Region *regions, int64_t count, int64_t slot_bits, int32_t *slots)
+{
+    const int64_t last = ((int64_t)1 << slot_bits) - 1;
+    for (int64_t row = 0; row < count; row++) {
+        int64_t slot = first_slot(regions[row].key, slot_bits);
+        while (slots[slot] >= 0) slot = (slot + 1) & last;
+        slots[slot] = (int32_t)row;
     }
 }
 
@@ -496,9 +630,11 @@ void streetfix_consistency(const float *rendered, int64_t height, int64_t width,
 /* clang-format off */
 const LayoutEntry streetfix_layout[] = {
     SURFEL_LAYOUT,
+    LAYOUT_STRUCT(Block), LAYOUT_FIELD(Block, filled), LAYOUT_FIELD(Block, first), LAYOUT_FIELD(Block, before),
+    LAYOUT_STRUCT(Region), LAYOUT_FIELD(Region, key), LAYOUT_FIELD(Region, first), LAYOUT_FIELD(Region, row),
     LAYOUT_STRUCT(Grid), LAYOUT_FIELD(Grid, ox), LAYOUT_FIELD(Grid, oy), LAYOUT_FIELD(Grid, oz),
-    LAYOUT_FIELD(Grid, cell), LAYOUT_FIELD(Grid, bx), LAYOUT_FIELD(Grid, by), LAYOUT_FIELD(Grid, bz),
-    LAYOUT_FIELD(Grid, block), LAYOUT_FIELD(Grid, nearest),
+    LAYOUT_FIELD(Grid, cell), LAYOUT_FIELD(Grid, slot_bits), LAYOUT_FIELD(Grid, slots), LAYOUT_FIELD(Grid, regions),
+    LAYOUT_FIELD(Grid, blocks), LAYOUT_FIELD(Grid, nearest),
     LAYOUT_STRUCT(Query), LAYOUT_FIELD(Query, count), LAYOUT_FIELD(Query, xyz), LAYOUT_FIELD(Query, ray),
     LAYOUT_FIELD(Query, sigma), LAYOUT_FIELD(Query, weight), LAYOUT_FIELD(Query, q),
     LAYOUT_STRUCT(Options), LAYOUT_FIELD(Options, iterations), LAYOUT_FIELD(Options, reach),
@@ -513,7 +649,7 @@ const LayoutEntry streetfix_layout[] = {
     LAYOUT_STRUCT(Beam), LAYOUT_FIELD(Beam, hit), LAYOUT_FIELD(Beam, new), LAYOUT_FIELD(Beam, removed),
     LAYOUT_FIELD(Beam, outlier), LAYOUT_FIELD(Beam, roughness_m), LAYOUT_FIELD(Beam, span_m), LAYOUT_FIELD(Beam, threshold_sigmas),
     LAYOUT_FIELD(Beam, margin_m), LAYOUT_FIELD(Beam, unmapped_m), LAYOUT_FIELD(Beam, scale), LAYOUT_FIELD(Beam, offset),
-    LAYOUT_CONSTANT(UNKNOWNS), LAYOUT_CONSTANT(BLOCK), LAYOUT_CONSTANT(BATCH_SIZE),
+    LAYOUT_CONSTANT(UNKNOWNS), LAYOUT_CONSTANT(BLOCK), LAYOUT_CONSTANT(KEY_BITS), LAYOUT_CONSTANT(REGION), LAYOUT_CONSTANT(BATCH_SIZE),
     LAYOUT_END,
 };
 /* clang-format on */

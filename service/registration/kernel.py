@@ -6,9 +6,11 @@ Speed: a solver step takes a sixth of the time of NumPy over all starts at once 
 """
 
 import ctypes
+from collections.abc import Iterator
 from ctypes import POINTER, Structure, byref, c_double, c_int64, c_void_p
 from dataclasses import astuple, dataclass, fields
 from functools import cache
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -17,18 +19,32 @@ from jaxtyping import Float32, Float64, Int32
 from numpy.typing import NDArray
 
 from service.compiled import load
+from service.errors import StreetfixError
 from service.geometry.camera import PinholeCamera
 
 #: Unknowns of the solver: translation (3), rotation (3), log scale, disparity offset.
 UNKNOWNS = 8
-#: Cells along the edge of a grid block.
+#: Cells along the edge of a block of the lookup grid. A block has 2 x 2 x 2 parts of 4 x 4 x 4 cells.
 BLOCK = 8
+#: Blocks along the edge of a region of the lookup grid.
+REGION = 8
+#: Bits of a region's number along each axis, in its key.
+KEY_BITS = 18
+#: Surfels that are assigned to regions at once.
+_CHUNK = 1 << 18
 #: Points in a batch of the kernel. Arrays of points are padded to whole batches.
 BATCH_SIZE = 32
 LIBRARY = Path(__file__).with_name("_kernel.so")
 
 #: A surfel: position (m, surfels' frame), unit normal, thickness across the surface (m), number of survey points.
 SURFEL = np.dtype([("xyz", "<f4", (3,)), ("normal", "<f4", (3,)), ("thickness_m", "<f4"), ("points", "<u4")])
+#: A block of the lookup grid with at least one filled cell. A filled cell has a surfel in reach of its centre.
+#: filled: 64 bits for each part, bit (x * 4 + y) * 4 + z for a cell. first: entry of its first filled cell in ``NearestGrid.nearest``.
+#: before: number of filled cells in the parts before each part.
+GRID_BLOCK = np.dtype([("filled", "<u8", (8,)), ("first", "<i8"), ("before", "<u2", (8,))])
+#: A region with at least one block. key: its numbers along x, y and z, 18 bits each, x first. first: row of its first block in
+#: ``NearestGrid.blocks``. row: row of each block, counted from ``first``, plus 1; 0 for none.
+GRID_REGION = np.dtype([("key", "<i8"), ("first", "<i8"), ("row", "<u2", (REGION**3,))])
 #: State of one start: pose of the level frame, scale, offset, centre and up axis of the priors, information, score, and how the
 #: solver ended.
 STATE = np.dtype(
@@ -42,9 +58,8 @@ STATE = np.dtype(
 class _Grid(Structure):
     _fields_ = [
         *((name, c_double) for name in ("ox", "oy", "oz", "cell")),
-        *((name, c_int64) for name in ("bx", "by", "bz")),
-        ("block", c_void_p),
-        ("nearest", c_void_p),
+        ("slot_bits", c_int64),
+        *((name, c_void_p) for name in ("slots", "regions", "blocks", "nearest")),
     ]
 
 
@@ -135,8 +150,17 @@ class _Beam(Structure):
 def _library() -> ctypes.CDLL:
     library = load(
         LIBRARY,
-        {"Surfel": SURFEL, "Grid": _Grid, "Query": _Query, "Options": _Options, "State": STATE, "Beam": _Beam},
-        {"UNKNOWNS": UNKNOWNS, "BLOCK": BLOCK, "BATCH_SIZE": BATCH_SIZE},
+        {
+            "Surfel": SURFEL,
+            "Block": GRID_BLOCK,
+            "Region": GRID_REGION,
+            "Grid": _Grid,
+            "Query": _Query,
+            "Options": _Options,
+            "State": STATE,
+            "Beam": _Beam,
+        },
+        {"UNKNOWNS": UNKNOWNS, "BLOCK": BLOCK, "KEY_BITS": KEY_BITS, "REGION": REGION, "BATCH_SIZE": BATCH_SIZE},
     )
     library.streetfix_align.argtypes = [
         POINTER(_Grid),
@@ -160,8 +184,12 @@ def _library() -> ctypes.CDLL:
     library.streetfix_consistency.argtypes = [
         c_void_p, c_int64, c_int64, c_int64, c_void_p, c_void_p, c_void_p, c_void_p, POINTER(_Beam), c_void_p,
     ]  # fmt: skip
-    library.streetfix_mark_blocks.argtypes = [POINTER(_Grid), c_void_p, c_int64, c_double, c_void_p]
-    library.streetfix_fill_grid.argtypes = [POINTER(_Grid), c_void_p, c_int64, c_double, c_void_p, c_void_p]
+    library.streetfix_lookup.argtypes = [POINTER(_Grid), c_void_p, c_int64, c_void_p]
+    library.streetfix_build_region.argtypes = [
+        POINTER(_Grid), c_void_p, c_void_p, c_int64, c_double, c_void_p, c_void_p, c_void_p, c_void_p, c_void_p,
+    ]  # fmt: skip
+    library.streetfix_build_region.restype = c_int64
+    library.streetfix_fill_slots.argtypes = [c_void_p, c_int64, c_int64, c_void_p]
     library.streetfix_render.argtypes = [
         c_void_p, c_void_p, c_int64, c_double, c_void_p, c_void_p, c_double, c_double, c_double, c_double, c_int64, c_int64,
         c_double, c_double, c_void_p,
@@ -169,8 +197,8 @@ def _library() -> ctypes.CDLL:
     for name in (
         "streetfix_align",
         "streetfix_gradients",
-        "streetfix_mark_blocks",
-        "streetfix_fill_grid",
+        "streetfix_lookup",
+        "streetfix_fill_slots",
         "streetfix_render",
     ):
         getattr(library, name).restype = None
@@ -179,22 +207,43 @@ def _library() -> ctypes.CDLL:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class NearestGrid:
-    """Lookup grid of the surfel nearest to each cell's centre, in blocks of 8 x 8 x 8 cells; may be memory-mapped.
+    """Lookup grid of the surfel nearest to each cell's centre; may be memory-mapped.
+
+    It has three levels: regions of 8 x 8 x 8 blocks of 8 x 8 x 8 cells. Regions, blocks and cells without a surfel in reach take no
+    memory. So the size follows the mapped surfaces, not the box around them.
 
     Attributes:
         origin_m: corner of the grid in the surfels' frame, m.
         cell_m: edge of a cell, m.
-        block: row of each block in ``nearest``; -1 where no surface is near.
-        nearest: index of the surfel nearest to each cell of each block; -1 where no surface is near.
+        slots: hash table with linear probing: row of a region in ``regions``, -1 for none. Its length is a power of two, at least twice
+            the number of regions.
+        regions: (R,) of ``GRID_REGION``, ascending by key.
+        blocks: (B,) of ``GRID_BLOCK``, region by region.
+        nearest: index of the surfel nearest to each filled cell, block by block, part by part, in the order of the bits.
     """
 
     origin_m: Float64[NDArray[np.float64], "3"]
     cell_m: float
-    block: Int32[NDArray[np.int32], "X Y Z"]
-    nearest: Int32[NDArray[np.int32], "N 512"]
+    slots: Int32[NDArray[np.int32], " H"]
+    regions: NDArray[Any]
+    blocks: NDArray[Any]
+    nearest: Int32[NDArray[np.int32], " F"]
+
+    def surfels_at(self, positions_m: Float64[NDArray[np.float64], "n 3"]) -> Int32[NDArray[np.int32], " n"]:
+        """Return the surfel that the cell of each position refers to; -1 for none.
+
+        Args:
+            positions_m: positions in the surfels' frame, m.
+        """
+        positions_m = np.ascontiguousarray(positions_m, np.float64)
+        found = np.empty(len(positions_m), np.int32)
+        _library().streetfix_lookup(byref(self._as_c()), positions_m.ctypes.data, len(positions_m), found.ctypes.data)
+        return found
 
     def _as_c(self) -> _Grid:
-        return _Grid(*self.origin_m, self.cell_m, *self.block.shape, self.block.ctypes.data, self.nearest.ctypes.data)
+        arrays = (self.slots, self.regions, self.blocks, self.nearest)
+        addresses = (each.ctypes.data for each in arrays)
+        return _Grid(*self.origin_m, self.cell_m, len(self.slots).bit_length() - 1, *addresses)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -331,25 +380,92 @@ def _as_c(query: QueryPoints, options: SolverOptions) -> tuple[_Query, _Options]
 def nearest_grid(surfels: NDArray[Any], *, cell_m: float, reach_m: float) -> NearestGrid:
     """Build the lookup grid of a map, once per map build.
 
+    It is built region by region. The memory grows with the number of surfels, not with the distances between them.
+
     Args:
         surfels: of the map, (S,) of ``SURFEL``.
         cell_m: edge of a cell, m.
         reach_m: largest distance from a surfel to the centre of a cell that refers to it, m.
+
+    Raises:
+        StreetfixError: the surfels lie too far from each other for the numbers of the regions.
     """
     low, high = surfels["xyz"].min(axis=0).astype(np.float64), surfels["xyz"].max(axis=0).astype(np.float64)
     origin = low - reach_m - 2 * cell_m
-    shape = np.ceil((high + reach_m + 2 * cell_m - origin) / (BLOCK * cell_m)).astype(int) + 1
-    mark = np.zeros(tuple(shape), np.uint8)
-    empty = NearestGrid(origin, cell_m, np.zeros(tuple(shape), np.int32), np.zeros((0, BLOCK**3), np.int32))
-    _library().streetfix_mark_blocks(byref(empty._as_c()), surfels.ctypes.data, len(surfels), reach_m, mark.ctypes.data)
-    block = np.where(mark > 0, np.cumsum(mark).reshape(mark.shape) - 1, -1).astype(np.int32)
-    nearest = np.full((int(mark.sum()), BLOCK**3), -1, np.int32)
-    distance2 = np.full(nearest.shape, np.inf, np.float32)
-    grid = NearestGrid(origin, cell_m, block, nearest)
-    _library().streetfix_fill_grid(
-        byref(grid._as_c()), surfels.ctypes.data, len(surfels), reach_m, nearest.ctypes.data, distance2.ctypes.data
-    )
-    return grid
+    extent_m, most_m = float((high + reach_m - origin).max()), (1 << KEY_BITS) * REGION * BLOCK * cell_m
+    if not extent_m < most_m:
+        raise StreetfixError(
+            f"the cloud extends over {extent_m / 1000:,.0f} km, but a lookup grid with cells of {cell_m:g} m reaches "
+            f"{most_m / 1000:,.0f} km; build a map of each area"
+        )
+    regions, blocks, nearest = [np.zeros(0, GRID_REGION)], [np.zeros(0, GRID_BLOCK)], [np.zeros(0, np.int32)]
+    first_block = first_cell = 0
+    for region, some, cells in _regions(surfels, origin, cell_m, reach_m):
+        region["first"], some["first"] = first_block, some["first"] + first_cell
+        first_block, first_cell = first_block + len(some), first_cell + len(cells)
+        regions.append(region)
+        blocks.append(some)
+        nearest.append(cells)
+    whole = np.concatenate(regions)
+    slot_bits = max(1, (2 * len(whole) - 1).bit_length())
+    slots = np.full(1 << slot_bits, -1, np.int32)
+    _library().streetfix_fill_slots(whole.ctypes.data, len(whole), slot_bits, slots.ctypes.data)
+    return NearestGrid(origin, cell_m, slots, whole, np.concatenate(blocks), np.concatenate(nearest))
+
+
+def _regions(
+    surfels: NDArray[Any], origin_m: Float64[NDArray[np.float64], "3"], cell_m: float, reach_m: float
+) -> Iterator[tuple[NDArray[Any], NDArray[Any], Int32[NDArray[np.int32], " f"]]]:
+    """Yield the regions with blocks, ascending by key: the region (1,), its blocks, and the surfels of their filled cells.
+
+    The field ``first`` of a block counts from the region's first filled cell.
+    """
+    frame = _Grid(*origin_m, cell_m)
+    edge = REGION * BLOCK
+    keys, which = _touched(surfels, origin_m, edge * cell_m, reach_m)
+    surfel_of, distance2 = np.empty(edge**3, np.int32), np.empty(edge**3, np.float32)
+    blocks, nearest = np.empty(REGION**3, GRID_BLOCK), np.empty(edge**3, np.int32)
+    starts = np.flatnonzero(np.r_[True, keys[1:] != keys[:-1]])
+    for first, end in zip(starts, np.r_[starts[1:], len(keys)], strict=True):
+        region, some = np.zeros(1, GRID_REGION), which[first:end]
+        region["key"] = keys[first]
+        count = _library().streetfix_build_region(
+            byref(frame),
+            surfels.ctypes.data,
+            some.ctypes.data,
+            len(some),
+            reach_m,
+            surfel_of.ctypes.data,
+            distance2.ctypes.data,
+            region.ctypes.data,
+            blocks.ctypes.data,
+            nearest.ctypes.data,
+        )
+        if count:  # the reach of a surfel may touch a region without reaching the centre of a cell
+            cells = int(np.bitwise_count(blocks["filled"][:count]).sum())
+            yield region, blocks[:count].copy(), nearest[:cells].copy()
+
+
+def _touched(
+    surfels: NDArray[Any], origin_m: Float64[NDArray[np.float64], "3"], region_m: float, reach_m: float
+) -> tuple[NDArray[np.int64], Int32[NDArray[np.int32], " p"]]:
+    """Return all pairs of a region and a surfel whose reach touches it: keys of regions, ascending, and indices of surfels.
+
+    The surfels of a region are ascending. So the first of two equally near surfels counts, wherever regions begin.
+    """
+    keys, numbers = [], []
+    for first in range(0, len(surfels), _CHUNK):
+        xyz = surfels["xyz"][first : first + _CHUNK].astype(np.float64) - origin_m
+        low, high = (np.floor((xyz + sign * reach_m) / region_m).astype(np.int64) for sign in (-1, 1))
+        for step in product(*(range(int(extent) + 1) for extent in (high - low).max(axis=0))):
+            region = low + step
+            inside = np.flatnonzero((region <= high).all(axis=1))
+            x, y, z = region[inside].T
+            keys.append((x << 2 * KEY_BITS) + (y << KEY_BITS) + z)
+            numbers.append((inside + first).astype(np.int32))
+    key, which = np.concatenate(keys), np.concatenate(numbers)
+    order = np.lexsort((which, key))
+    return key[order], which[order]
 
 
 def render(

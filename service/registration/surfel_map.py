@@ -12,7 +12,7 @@ from jaxtyping import Float32, Float64
 from numpy.typing import NDArray
 
 from service.errors import BundleError
-from service.registration.kernel import BLOCK, SURFEL, NearestGrid, nearest_grid
+from service.registration.kernel import GRID_BLOCK, GRID_REGION, SURFEL, NearestGrid, nearest_grid
 
 #: Edge of a cell of the lookup grid, and largest distance from a surfel to a cell that refers to it, m.
 CELL_M, REACH_M = 0.4, 1.2
@@ -29,8 +29,10 @@ _EXPECTED: dict[str, tuple[np.dtype[Any], tuple[int, ...]]] = {
     "surfels": (SURFEL, (-1,)),
     "tiles": (_FLOATS, (-1, 4)),
     "grid_frame": (_FLOATS, (4,)),
-    "grid_block": (_NUMBERS, (-1, -1, -1)),
-    "grid_nearest": (_NUMBERS, (-1, BLOCK**3)),
+    "grid_slots": (_NUMBERS, (-1,)),
+    "grid_regions": (GRID_REGION, (-1,)),
+    "grid_blocks": (GRID_BLOCK, (-1,)),
+    "grid_nearest": (_NUMBERS, (-1,)),
 }
 
 
@@ -79,15 +81,18 @@ class SurfelMap:
         """Return the arrays to write, by name; ``from_arrays`` reads them again.
 
         Returns:
-            origin (3,), surfels (S,), tiles (T, 4), grid_frame (4,), grid_block (X, Y, Z), grid_nearest (B, 512). A map with intensities
-            also has brightness (S,). ``grid_frame`` holds the grid's origin and the edge of its cells, m.
+            origin (3,), surfels (S,), tiles (T, 4), grid_frame (4,), grid_slots (H,), grid_regions (R,), grid_blocks (B,),
+            grid_nearest (F,). A map with intensities also has brightness (S,). ``grid_frame`` holds the grid's origin and the
+            edge of its cells, m.
         """
         arrays = {
             "origin": self.origin_m,
             "surfels": self.surfels,
             "tiles": self.tiles,
             "grid_frame": np.array([*self.grid.origin_m, self.grid.cell_m]),
-            "grid_block": self.grid.block,
+            "grid_slots": self.grid.slots,
+            "grid_regions": self.grid.regions,
+            "grid_blocks": self.grid.blocks,
             "grid_nearest": self.grid.nearest,
         }
         return arrays if self.brightness is None else arrays | {BRIGHTNESS: self.brightness}
@@ -98,7 +103,7 @@ class SurfelMap:
 
         Args:
             arrays: arrays by name, as ``arrays`` returns them: origin (3,), surfels (S,), tiles (T, 4), grid_frame (4,),
-                grid_block (X, Y, Z), grid_nearest (B, 512) and, if the map has intensities, brightness (S,).
+                grid_slots (H,), grid_regions (R,), grid_blocks (B,), grid_nearest (F,) and, if the map has intensities, brightness (S,).
             verify: check every index and number. The kernel itself does not check them.
 
         Raises:
@@ -119,7 +124,9 @@ class SurfelMap:
                 BRIGHTNESS, f"{brightness.dtype} of shape {brightness.shape} instead of one {_BRIGHT} per surfel"
             )
         frame = np.array(arrays["grid_frame"])
-        grid = NearestGrid(frame[:3], float(frame[3]), arrays["grid_block"], arrays["grid_nearest"])
+        grid = NearestGrid(
+            frame[:3], float(frame[3]), *(arrays[f"grid_{name}"] for name in ("slots", "regions", "blocks", "nearest"))
+        )
         found = cls(np.array(arrays["origin"]), arrays["surfels"], np.array(arrays["tiles"]), grid, brightness)
         if verify:
             found.require_consistent()
@@ -133,8 +140,8 @@ class SurfelMap:
         """
         if not np.isfinite(self.grid.origin_m).all() or not self.grid.cell_m > 0:
             raise _defect("grid_frame", "the origin is not finite, or the cell size is not positive")
-        _require_indices("grid_block", self.grid.block, len(self.grid.nearest))
-        _require_indices("grid_nearest", self.grid.nearest, len(self.surfels))
+        _require_levels(self.grid)
+        _require_indices("grid_nearest", self.grid.nearest, len(self.surfels), least=0)
         first, count = self.tiles[:, 2], self.tiles[:, 3]
         if not np.isfinite(self.tiles).all() or (first < 0).any() or (count < 0).any():
             raise _defect("tiles", "a number is not finite, or an index is negative")
@@ -149,8 +156,28 @@ class SurfelMap:
                 raise _defect("surfels", f"a number of {name} is not finite")
 
 
-def _require_indices(name: str, indices: NDArray[np.int32], count: int) -> None:
-    if indices.size and (int(indices.min()) < -1 or int(indices.max()) >= count):
+def _require_levels(grid: NearestGrid) -> None:
+    """Check that every region is in the hash table once, its blocks are in ``blocks``, and their filled cells in ``nearest``."""
+    slots, regions, blocks = grid.slots, grid.regions, grid.blocks
+    if len(slots) < 2 or len(slots) & (len(slots) - 1) or len(slots) <= len(regions):
+        raise _defect(
+            "grid_slots", f"{len(slots)} slots for {len(regions)} regions instead of a power of two above their number"
+        )
+    _require_indices("grid_slots", slots, len(regions), least=-1)
+    if not np.array_equal(np.sort(slots[slots >= 0]), np.arange(len(regions))):
+        raise _defect("grid_slots", "a region is missing or occurs twice")
+    most = regions["row"].max(axis=1, initial=0).astype(np.int64)
+    if (regions["first"] < 0).any() or (regions["first"] > len(blocks) - most).any():
+        raise _defect("grid_regions", f"a block is outside the {len(blocks)} entries of grid_blocks")
+    cells = np.cumsum(np.bitwise_count(blocks["filled"]), axis=1, dtype=np.int64)
+    if (blocks["before"][:, 0] != 0).any() or (blocks["before"][:, 1:] != cells[:, :-1]).any():
+        raise _defect("grid_blocks", "a number of filled cells is wrong")
+    if (blocks["first"] < 0).any() or (blocks["first"] > len(grid.nearest) - cells[:, -1]).any():
+        raise _defect("grid_blocks", f"a cell is outside the {len(grid.nearest)} entries of grid_nearest")
+
+
+def _require_indices(name: str, indices: NDArray[np.int32], count: int, *, least: int) -> None:
+    if indices.size and (int(indices.min()) < least or int(indices.max()) >= count):
         raise _defect(name, f"an index is outside the {count} entries")
 
 

@@ -104,8 +104,8 @@ def test_a_folder_that_is_no_bundle_is_one_defect(run, tmp_path):
 
 def test_a_manifest_of_another_format_is_named(own):
     manifest = json.loads((own / "manifest.json").read_text())
-    (own / "manifest.json").write_text(json.dumps(manifest | {"format": 2}))
-    assert "format 2" in damage_of(own)[0]
+    (own / "manifest.json").write_text(json.dumps(manifest | {"format": 3}))
+    assert "format 3" in damage_of(own)[0]
 
 
 @pytest.mark.parametrize(

@@ -1,3 +1,4 @@
+import tracemalloc
 from typing import Any
 
 import numpy as np
@@ -6,9 +7,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial import cKDTree
 
+from benchmarks.native.plain import surfels_of_cells
 from service.errors import StreetfixError
 from service.registration import kernel
-from service.registration.kernel import BLOCK, SURFEL, nearest_grid
+from service.registration.kernel import BLOCK, REGION, SURFEL, nearest_grid
+
+#: Shares of a random map: surfels in one heap, in two heaps a region apart, and in two towns 60 km apart.
+APART_M = [0.0, 30.0, 60_000.0]
 
 
 def surfels_at(xyz):
@@ -17,27 +22,63 @@ def surfels_at(xyz):
     return surfels
 
 
-def cells_of(grid):
-    """Return centre and surfel of every cell of every block, filled or not; -1 for none."""
-    size = np.array(grid.block.shape) * BLOCK
-    cell = np.stack(np.meshgrid(*(np.arange(n) for n in size), indexing="ij"), axis=-1).reshape(-1, 3)
-    block = grid.block[tuple(cell.T // BLOCK)]
-    inside = cell % BLOCK @ [BLOCK * BLOCK, BLOCK, 1]
-    return grid.origin_m + (cell + 0.5) * grid.cell_m, np.where(block < 0, -1, grid.nearest[block, inside])
+def cells_around(grid, surfels, reach_m):
+    """Return all cells of the box around each surfel, one cell wider than its reach, each once (n, 3)."""
+    half = int(np.ceil(reach_m / grid.cell_m)) + 1
+    steps = np.stack(np.meshgrid(*[np.arange(-half, half + 1)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
+    own = np.floor((surfels["xyz"].astype(np.float64) - grid.origin_m) / grid.cell_m).astype(np.int64)
+    return np.unique((np.unique(own, axis=0)[:, None] + steps).reshape(-1, 3), axis=0)
 
 
-@given(
+def dense_grid(surfels, cells, grid, reach_m):
+    """Return the surfel of each cell by brute force, with the rounding of the dense grid of format 3."""
+    centres = grid.origin_m + (cells + 0.5) * grid.cell_m
+    offset = centres[:, None] - surfels["xyz"].astype(np.float64)
+    distance2 = (offset[..., 0] ** 2 + offset[..., 1] ** 2 + offset[..., 2] ** 2).astype(np.float32)
+    distance2[distance2.astype(np.float64) > reach_m * reach_m] = np.inf
+    nearest = distance2.argmin(axis=1)  # the first of two equally near surfels
+    return np.where(np.isfinite(distance2[np.arange(len(cells)), nearest]), nearest, -1)
+
+
+random_maps = given(
     seed=st.integers(0, 10**6),
     count=st.integers(1, 60),
     cell_m=st.sampled_from([0.3, 0.4, 0.9]),
     reach_m=st.sampled_from([0.5, 1.2, 2.0]),
     extent_m=st.sampled_from([0.0, 1.0, 5.0]),
+    apart_m=st.sampled_from(APART_M),
 )
-@settings(max_examples=30)
-def test_every_cell_within_reach_holds_its_nearest_surfel_and_every_other_none(seed, count, cell_m, reach_m, extent_m):
+
+
+def random_surfels(seed, count, extent_m, apart_m):
     rng = np.random.default_rng(seed)
-    surfels = surfels_at(rng.uniform(-500, 500, 3) + rng.uniform(0, extent_m, (count, 3)))
-    centres, found = cells_of(nearest_grid(surfels, cell_m=cell_m, reach_m=reach_m))
+    towns = rng.integers(0, 2, (count, 1)) * [0.8 * apart_m, -0.6 * apart_m, 0]
+    return surfels_at(rng.uniform(-500, 500, 3) + towns + rng.uniform(0, extent_m, (count, 3)))
+
+
+@random_maps
+@settings(max_examples=30, deadline=None)
+def test_every_cell_holds_the_surfel_that_a_dense_grid_holds(seed, count, cell_m, reach_m, extent_m, apart_m):
+    surfels = random_surfels(seed, count, extent_m, apart_m)
+    grid = nearest_grid(surfels, cell_m=cell_m, reach_m=reach_m)
+    cells = cells_around(grid, surfels, reach_m)
+    expected = dense_grid(surfels, cells, grid, reach_m)
+    centres = grid.origin_m + (cells + 0.5) * cell_m
+    np.testing.assert_array_equal(grid.surfels_at(centres), expected)
+    np.testing.assert_array_equal(surfels_of_cells(grid, cells), expected)
+    assert len(grid.nearest) == (expected >= 0).sum()  # and no cell outside these boxes is filled
+
+
+@random_maps
+@settings(max_examples=30, deadline=None)
+def test_every_cell_within_reach_holds_its_nearest_surfel_and_every_other_none(
+    seed, count, cell_m, reach_m, extent_m, apart_m
+):
+    surfels = random_surfels(seed, count, extent_m, apart_m)
+    grid = nearest_grid(surfels, cell_m=cell_m, reach_m=reach_m)
+    cells = cells_around(grid, surfels, reach_m)
+    centres = grid.origin_m + (cells + 0.5) * cell_m
+    found = grid.surfels_at(centres)
     xyz = surfels["xyz"].astype(np.float64)
     tree: Any = cKDTree(xyz)
     distance, _ = tree.query(centres)
@@ -47,20 +88,61 @@ def test_every_cell_within_reach_holds_its_nearest_surfel_and_every_other_none(s
     np.testing.assert_allclose(np.linalg.norm(centres - xyz[found], axis=1)[held], distance[held], atol=1e-4)
 
 
-def test_no_cell_within_reach_lies_outside_the_grid():
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf, 1e30, -1e30, 1e9, -0.5, 6.8e6])
+def test_a_position_outside_the_grid_has_no_surfel(value):
     surfels = surfels_at(np.random.default_rng(1).uniform(0, 3, (40, 3)))
     grid = nearest_grid(surfels, cell_m=0.4, reach_m=1.2)
-    low, high = grid.origin_m, grid.origin_m + np.array(grid.block.shape) * BLOCK * grid.cell_m
-    assert (low < surfels["xyz"].min(axis=0) - 1.2).all()
-    assert (high > surfels["xyz"].max(axis=0) + 1.2).all()
+    inside = np.tile(surfels["xyz"][:1].astype(np.float64), (3, 1))
+    assert (grid.surfels_at(inside) >= 0).all()
+    np.fill_diagonal(inside, grid.origin_m + value)
+    np.testing.assert_array_equal(grid.surfels_at(inside), -1)
+
+
+def test_positions_of_many_regions_alternate():
+    """The kernel remembers the last regions; two regions that are 8 regions apart share an entry."""
+    step = 8 * REGION * BLOCK * 0.5
+    surfels = surfels_at([[k * step, 0, 0] for k in range(5)])
+    grid = nearest_grid(surfels, cell_m=0.5, reach_m=1.0)
+    order = np.random.default_rng(0).integers(-1, 6, 1000)
+    expected = np.where((order >= 0) & (order < 5), order, -1)
+    np.testing.assert_array_equal(grid.surfels_at(np.c_[order * step, np.zeros((1000, 2))]), expected)
+
+
+def bytes_of(grid):
+    return sum(each.nbytes for each in (grid.slots, grid.regions, grid.blocks, grid.nearest))
+
+
+def test_two_towns_60_km_apart_take_what_both_take():
+    """Also while the grid is built: nothing covers the ground between them."""
+    town = np.random.default_rng(1).uniform(0, [60, 60, 6], (20_000, 3))
+    parts = [town, town + [45_000.0, 40_000.0, 300.0]]
+
+    def cost(xyz):
+        surfels = surfels_at(xyz)
+        nearest_grid(surfels[:10], cell_m=0.4, reach_m=1.2)  # what the first call loads does not count
+        tracemalloc.start()
+        grid = nearest_grid(surfels, cell_m=0.4, reach_m=1.2)
+        peak = tracemalloc.get_traced_memory()[1]
+        tracemalloc.stop()
+        return bytes_of(grid), peak
+
+    one, other, both = (cost(xyz) for xyz in (*parts, np.concatenate(parts)))
+    for alone, together in zip(np.add(one, other), both, strict=True):
+        assert together < 1.05 * alone
 
 
 def test_blocks_far_from_every_surfel_take_no_space():
     surfels = surfels_at([[0.0, 0, 0], [100, 0, 0]])
     grid = nearest_grid(surfels, cell_m=0.5, reach_m=1.0)
-    assert grid.block.size > 25
-    assert len(grid.nearest) == (grid.block >= 0).sum() <= 16
-    np.testing.assert_array_equal(np.sort(grid.block[grid.block >= 0]), np.arange(len(grid.nearest)))
+    assert 2 <= len(grid.regions) <= 16
+    assert len(grid.blocks) == (grid.regions["row"] > 0).sum() <= 16
+    assert len(grid.nearest) == np.bitwise_count(grid.blocks["filled"]).sum() <= 2 * 5**3
+
+
+def test_surfels_beyond_the_numbers_of_the_regions_are_refused():
+    surfels = surfels_at([[0.0, 0, 0], [0, 7e6, 0]])
+    with pytest.raises(StreetfixError, match=r"extends over 7,000 km, .* of 0\.4 m reaches 6,711 km; build a map of"):
+        nearest_grid(surfels, cell_m=0.4, reach_m=1.2)
 
 
 def test_a_missing_library_says_what_to_do(monkeypatch, tmp_path):

@@ -5,7 +5,12 @@ from service.errors import BundleError
 from service.registration.kernel import SURFEL, SolverOptions, align
 from service.registration.surfel_map import SurfelMap
 
-REQUIRED = ["origin", "surfels", "tiles", *(f"grid_{array}" for array in ("frame", "block", "nearest"))]
+REQUIRED = [
+    "origin",
+    "surfels",
+    "tiles",
+    *(f"grid_{array}" for array in ("frame", "slots", "regions", "blocks", "nearest")),
+]
 NAMES = [*REQUIRED, "brightness"]
 
 
@@ -76,7 +81,7 @@ def test_an_array_of_another_type_is_named(arrays, name):
     refused(arrays, name, "float32 of shape")
 
 
-@pytest.mark.parametrize("name", ["origin", "grid_frame", "grid_block", "grid_nearest"])
+@pytest.mark.parametrize("name", ["origin", "grid_frame", "grid_slots", "grid_nearest"])
 def test_numbers_of_another_byte_order_are_refused(arrays, name):
     arrays[name] = arrays[name].astype(arrays[name].dtype.newbyteorder(">"))
     refused(arrays, name, "of shape .* instead of")
@@ -85,28 +90,66 @@ def test_numbers_of_another_byte_order_are_refused(arrays, name):
 @pytest.mark.parametrize(
     ("name", "shape"),
     [("origin", (4,)), ("origin", (1, 3)), ("surfels", (2, 3)), ("tiles", (2, 3)), ("tiles", (8,)),
-     ("grid_frame", (3,)), ("grid_frame", (5,)), ("grid_block", (4, 4)), ("grid_block", (64,)),
-     ("grid_nearest", (3, 511)), ("grid_nearest", (3, 8, 8, 8))],
+     ("grid_frame", (3,)), ("grid_frame", (5,)), ("grid_slots", (4, 4)), ("grid_regions", (1, 2)), ("grid_blocks", (4, 4)),
+     ("grid_nearest", (3, 512))],
 )  # fmt: skip
 def test_an_array_of_another_shape_is_named(arrays, name, shape):
     arrays[name] = np.zeros(shape, arrays[name].dtype)
     refused(arrays, name, "of shape")
 
 
-@pytest.mark.parametrize("name", ["tiles", "grid_block", "grid_nearest"])
+@pytest.mark.parametrize("name", ["tiles"])
 def test_an_array_in_another_order_of_memory_is_named(arrays, name):
     arrays[name] = np.asfortranarray(arrays[name])
     refused(arrays, name, "of shape")
 
 
-@pytest.mark.parametrize("name", ["grid_block", "grid_nearest"])
 @pytest.mark.parametrize("beyond", [True, False])
-def test_an_index_that_points_outside_is_named(arrays, name, beyond):
-    among = arrays[name.replace("block", "nearest")] if "block" in name else arrays["surfels"]
-    arrays[name].flat[3] = len(among) if beyond else -2
-    refused(arrays, name, f"an index is outside the {len(among)} entries")
-    arrays[name].flat[3] = len(among) - 1 if beyond else -1
-    assert len(SurfelMap.from_arrays(arrays).surfels) == len(arrays["surfels"])
+def test_an_index_that_points_outside_is_named(arrays, beyond):
+    surfels = arrays["surfels"]
+    arrays["grid_nearest"][3] = len(surfels) if beyond else -1
+    refused(arrays, "grid_nearest", f"an index is outside the {len(surfels)} entries")
+    arrays["grid_nearest"][3] = len(surfels) - 1 if beyond else 0
+    assert len(SurfelMap.from_arrays(arrays).surfels) == len(surfels)
+
+
+@pytest.mark.parametrize("kept", [-1, 1, 0])
+def test_a_hash_table_without_a_free_slot_or_of_another_length_is_refused(arrays, kept):
+    full = np.arange(1 << (len(arrays["grid_regions"]).bit_length() - 1), dtype="<i4")
+    arrays["grid_slots"] = arrays["grid_slots"][:kept] if kept else full
+    refused(arrays, "grid_slots", "instead of a power of two above their number")
+
+
+@pytest.mark.parametrize(
+    ("value", "what"),
+    [
+        (-2, "an index is outside the .* entries"),
+        (10**6, "an index is outside the .* entries"),
+        (1, "a region is missing or occurs twice"),
+        (-1, "a region is missing or occurs twice"),
+    ],
+)
+def test_a_hash_table_that_loses_a_region_is_refused(arrays, value, what):
+    arrays["grid_slots"][arrays["grid_slots"] == 0] = value
+    refused(arrays, "grid_slots", what)
+
+
+@pytest.mark.parametrize(
+    ("name", "field", "value", "what"),
+    [
+        ("grid_regions", "first", -1, "a block is outside the .* entries of grid_blocks"),
+        ("grid_regions", "first", 10**9, "a block is outside the .* entries of grid_blocks"),
+        ("grid_regions", "row", 513, "a block is outside the .* entries of grid_blocks"),
+        ("grid_blocks", "first", -1, "a cell is outside the .* entries of grid_nearest"),
+        ("grid_blocks", "first", 10**9, "a cell is outside the .* entries of grid_nearest"),
+        ("grid_blocks", "first", 2**63 - 1, "a cell is outside the .* entries of grid_nearest"),
+        ("grid_blocks", "before", 400, "a number of filled cells is wrong"),
+        ("grid_blocks", "filled", 0, "a number of filled cells is wrong"),
+    ],
+)
+def test_a_level_of_the_grid_that_points_outside_is_refused(arrays, name, field, value, what):
+    arrays[name][field][-1] = value
+    refused(arrays, name, what)
 
 
 def test_a_tile_that_ends_beyond_the_surfels_is_refused(arrays):
@@ -140,8 +183,8 @@ def test_other_numbers_that_are_none_are_refused(arrays, name, field):
 
 
 def test_the_check_of_every_index_can_be_skipped(arrays):
-    arrays["grid_nearest"][0, 0] = 10**6
-    assert SurfelMap.from_arrays(arrays, verify=False).grid.nearest[0, 0] == 10**6
+    arrays["grid_nearest"][0] = 10**6
+    assert SurfelMap.from_arrays(arrays, verify=False).grid.nearest[0] == 10**6
     with pytest.raises(BundleError):
         SurfelMap.from_arrays(arrays, verify=False).require_consistent()
 
