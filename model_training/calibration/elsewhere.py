@@ -29,7 +29,6 @@ class RemainingViews(ViewIndex):
     def __init__(self, whole: ViewIndex, remaining: NDArray[np.bool_]) -> None:
         self._whole, self._remaining = whole, remaining
         self._views = np.flatnonzero(remaining)
-        self.is_finite = whole.is_finite
 
     def __len__(self) -> int:
         return len(self._views)
@@ -52,7 +51,7 @@ class RemainingViews(ViewIndex):
         return found[self._remaining[found]]
 
     def vectors(self, views: NDArray[np.int64]) -> Descriptors:
-        """Return the exact descriptors of some views.
+        """Return the descriptors of some views.
 
         Args:
             views: indices of the views (n,).

@@ -6,11 +6,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from model_training.mapping.voxel_map import VOXEL, VOXEL_WITHOUT_BRIGHTNESS, VoxelMap, lattice_origin
+from model_training.mapping.voxel_map import VOXEL, VoxelMap, lattice_origin
 from service.errors import BundleError
-from service.imaging.npy_header import NPY_HEADER_ERRORS
 from service.maps import content as parts
 from service.maps import streets
+from service.maps.byte_planes import read_records
 from service.maps.content import BundleContent
 from service.maps.reader import MapBundle
 
@@ -86,7 +86,7 @@ def empty_voxels_of(bundle: MapBundle) -> VoxelMap:
 def voxels_of(bundle: MapBundle) -> VoxelMap:
     """Return the voxels of a bundle, ready for more points.
 
-    A bundle that stores the sums of its voxels returns them unchanged. An older bundle has only surfels, so its voxels are approximated.
+    A bundle that stores the sums of its voxels returns them unchanged. The voxels of another bundle are approximated from its surfels.
     The points of a surfel then spread evenly around its mean, as wide as the voxel and as thick as the surfel. Voxels with too few
     points for a surfel are lost.
 
@@ -114,7 +114,7 @@ def voxels_of(bundle: MapBundle) -> VoxelMap:
 
 
 def read_statistics(bundle: MapBundle) -> NDArray[Any]:
-    """Read the sums of the voxels' points: (n,) of ``VOXEL`` or ``VOXEL_WITHOUT_BRIGHTNESS``.
+    """Read the sums of the voxels' points: (n,) of ``VOXEL``.
 
     Args:
         bundle: a bundle that stores sums.
@@ -122,17 +122,13 @@ def read_statistics(bundle: MapBundle) -> NDArray[Any]:
     Raises:
         BundleError: the file cannot be read, has another type, or holds an empty voxel or a sum that is not finite.
     """
-    path = bundle.path / parts.STATISTICS_FILE
     try:
-        found = np.load(path, allow_pickle=False, mmap_mode="r")
-    except (OSError, *NPY_HEADER_ERRORS) as error:
-        raise _defect(bundle, f"not a valid array file ({error})") from error
-    if found.dtype not in (VOXEL, VOXEL_WITHOUT_BRIGHTNESS) or found.ndim != 1:
-        raise _defect(bundle, f"unexpected type {found.dtype} in {found.ndim} dimensions")
-    numbers = [found[name] for name in ("sums", "brightness") if name in (found.dtype.names or ())]
-    if not all(np.isfinite(each).all() for each in numbers) or not (found["points"] > 0).all():
+        found = read_records(bundle.path / parts.STATISTICS_FILE, VOXEL)
+    except (OSError, ValueError) as error:
+        raise _defect(bundle, f"not a valid file of voxels ({error})") from error
+    if not all(np.isfinite(found[name]).all() for name in ("sums", "brightness")) or not (found["points"] > 0).all():
         raise _defect(bundle, "a voxel has no points, or a sum that is not finite")
-    return np.asarray(found)
+    return found
 
 
 def _defect(bundle: MapBundle, what: str) -> BundleError:

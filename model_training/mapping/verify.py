@@ -16,8 +16,6 @@ from service.maps.writer import sha256_of
 
 #: Progress callback: stage, finished steps, all steps.
 Report = Callable[[str, int, int], None]
-#: Largest error of the length of a unit vector.
-_LENGTH_OFF = 1e-3
 #: Largest distance of a place from its street, metres. Joining maps may move the rim of a street.
 _OUTSIDE_M = 1.0
 #: Number of descriptors that are read at once.
@@ -66,7 +64,7 @@ def _contradictions(bundle: MapBundle) -> Iterator[str]:
     off = 0
     for first in range(0, len(bundle.views), _CHUNK):
         vectors = bundle.view_index.vectors(np.arange(first, min(first + _CHUNK, len(bundle.views))))
-        off += int((np.abs(np.linalg.norm(vectors, axis=1) - 1) > _LENGTH_OFF).sum())
+        off += int((np.abs(np.linalg.norm(vectors, axis=1) - 1) > index.LENGTH_OFF).sum())
     if off:
         yield f"{bundle.path / index.FILE}: {off} descriptors are not unit vectors"
     R = bundle.T_map_place[:, :3, :3]

@@ -32,9 +32,10 @@ _WAITING = 1 << 20
 
 #: A voxel as a bundle stores it, for merging maps. ``cell``: its cell; all maps of one edge share one lattice through the zero of the map
 #: frame. ``points``: number of points. ``sums``: their sums (m) and sums of products (m2) about the voxel's centre.
-VOXEL_WITHOUT_BRIGHTNESS = np.dtype([("cell", "<i4", (3,)), ("points", "<u4"), ("sums", "<f4", (9,))])
-#: The same with the sum of brightness and the number of points that have one. Older maps lack these two.
-VOXEL = np.dtype([*VOXEL_WITHOUT_BRIGHTNESS.descr, ("brightness", "<f4"), ("bright_points", "<u4")])
+#: ``brightness``: sum of brightness. ``bright_points``: number of points that have one.
+VOXEL = np.dtype(
+    [("cell", "<i4", (3,)), ("points", "<u4"), ("sums", "<f4", (9,)), ("brightness", "<f4"), ("bright_points", "<u4")]
+)
 
 
 @dataclass(frozen=True)
@@ -177,7 +178,7 @@ class VoxelMap:
         Single precision changes a mean by less than a micrometre.
 
         Args:
-            statistics: (n,) of ``VOXEL`` or ``VOXEL_WITHOUT_BRIGHTNESS``.
+            statistics: (n,) of ``VOXEL``.
 
         Raises:
             DatasetError: a voxel lies beyond the reach of this map.
@@ -187,8 +188,7 @@ class VoxelMap:
         keys = _keys_of_cells(cell)
         moments = np.zeros((len(keys), _MOMENTS))
         moments[:, 0], moments[:, 1 : _BRIGHT.start] = statistics["points"], statistics["sums"]
-        if statistics.dtype == VOXEL:
-            moments[:, _BRIGHT] = np.stack([statistics["brightness"], statistics["bright_points"]], axis=1)
+        moments[:, _BRIGHT] = np.stack([statistics["brightness"], statistics["bright_points"]], axis=1)
         self.add_sums(*_summed(keys, moments))
 
     def add_moments(self, means: NDArray[np.float64], points: NDArray[Any], covariances: NDArray[np.float64]) -> None:

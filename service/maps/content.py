@@ -16,7 +16,7 @@ ENCODER_FILE = "encoder.onnx"
 CALIBRATION_FILE, PREVIEW_FILE = "calibration.json", "preview.webp"
 CLOUD_FOLDER = "cloud"
 #: Voxel statistics for merging and updating maps. The service only checks the hash of this file.
-STATISTICS_FILE = "voxels.npy"
+STATISTICS_FILE = "voxels.zst"
 
 #: Largest coordinate of a pose (m). Largest error of an entry of R R^T, which allows for rounded numbers.
 MOST_AWAY_M, _SKEW = 1e7, 1e-3

@@ -1,18 +1,24 @@
-"""The memory-mapped FAISS index of view descriptors, and a coarse copy in memory that makes a shortlist for it.
+"""The memory-mapped descriptors of the views, and a coarse copy in memory that makes a shortlist for them.
 
-FAISS makes the coarse copy: principal axes and 8-bit numbers. Decision 0144 compares it with code of our own.
+A descriptor is stored as 8-bit numbers (decision 0155). FAISS makes the coarse copy: principal axes and 8-bit numbers. Decision 0144
+compares it with code of our own.
 """
 
 from pathlib import Path
 
 import faiss
 import numpy as np
-from jaxtyping import Float32, Int64
+from jaxtyping import Float32, Int8, Int64
 from numpy.typing import NDArray
 
 from service.errors import BundleError
+from service.imaging.npy_header import NPY_HEADER_ERRORS
 
-FILE = "views.faiss"
+FILE = "descriptors.npy"
+#: Largest error of the length of a unit vector.
+LENGTH_OFF = 1e-3
+#: Largest 8-bit number.
+_MOST = 127
 #: Number of principal axes of the coarse copy. With fewer, the list loses similar views (decision 0144).
 _AXES = 64
 #: Smallest number of views for a coarse copy. A scan of fewer exact descriptors takes no longer.
@@ -33,103 +39,102 @@ def search_with_one_thread() -> None:
     faiss.omp_set_num_threads(1)
 
 
-def write_index(path: Path, descriptors: Descriptors) -> None:
-    """Write descriptors as a flat FAISS index of inner products.
+def write_descriptors(path: Path, descriptors: Descriptors) -> None:
+    """Write descriptors as 8-bit numbers.
+
+    The largest component of a vector becomes 127 or -127, and its length is forgotten. A vector that was read and is written again
+    keeps its numbers, so a merged or updated map has the same descriptors.
 
     Args:
         path: the new file.
         descriptors: unit vectors, a row per view.
     """
-    index = faiss.IndexFlatIP(descriptors.shape[1])
-    index.add(np.ascontiguousarray(descriptors))
-    faiss.write_index(index, str(path))
+    numbers = np.empty(descriptors.shape, np.int8)
+    for first in range(0, len(descriptors), _CHUNK):
+        some = descriptors[first : first + _CHUNK]
+        largest = np.abs(some).max(axis=1, keepdims=True, initial=1e-30)
+        numbers[first : first + _CHUNK] = np.rint(some * (_MOST / largest))
+    np.save(path, numbers, allow_pickle=False)
 
 
-def _coarse_copy(index: faiss.Index) -> tuple[faiss.Index, Float32[NDArray[np.float32], " D"]]:
+def _vectors_of(numbers: Int8[NDArray[np.int8], "n D"]) -> Descriptors:
+    """Return the unit vectors of some 8-bit descriptors; a descriptor of zeros stays zero."""
+    vectors = numbers.astype(np.float32)
+    vectors /= np.maximum(np.sqrt(np.einsum("nd,nd->n", vectors, vectors)), 1)[:, None]
+    return vectors
+
+
+def _coarse_copy(numbers: Int8[NDArray[np.int8], "n D"]) -> tuple[faiss.Index, Float32[NDArray[np.float32], " D"]]:
     """Return an index of 8-bit components along the principal axes, and the mean descriptor that it subtracts.
 
     The copy is small, so a scan of it hardly waits for memory.
 
     Args:
-        index: the exact index, with at least ``_FEWEST`` views.
+        numbers: descriptors of at least ``_FEWEST`` views.
     """
-    axes = faiss.PCAMatrix(index.d, min(_AXES, index.d))
-    numbers = faiss.IndexScalarQuantizer(axes.d_out, faiss.ScalarQuantizer.QT_8bit_uniform, faiss.METRIC_INNER_PRODUCT)
-    coarse = faiss.IndexPreTransform(axes, numbers)
-    coarse.train(index.reconstruct_batch(np.arange(0, index.ntotal, -(-index.ntotal // _SAMPLE))))
-    for first in range(0, index.ntotal, _CHUNK):
-        coarse.add(index.reconstruct_n(first, min(_CHUNK, index.ntotal - first)))
+    axes = faiss.PCAMatrix(numbers.shape[1], min(_AXES, numbers.shape[1]))
+    codes = faiss.IndexScalarQuantizer(axes.d_out, faiss.ScalarQuantizer.QT_8bit_uniform, faiss.METRIC_INNER_PRODUCT)
+    coarse = faiss.IndexPreTransform(axes, codes)
+    coarse.train(_vectors_of(numbers[:: -(-len(numbers) // _SAMPLE)]))
+    for first in range(0, len(numbers), _CHUNK):
+        coarse.add(_vectors_of(numbers[first : first + _CHUNK]))
     return coarse, np.array(faiss.vector_to_array(axes.mean), np.float32)
 
 
-def _is_finite(index: faiss.Index) -> bool:
-    """Return whether all descriptors are finite.
-
-    Args:
-        index: the exact index.
-    """
-    pieces = (index.reconstruct_n(first, min(_CHUNK, index.ntotal - first)) for first in range(0, index.ntotal, _CHUNK))
-    return all(bool(np.isfinite(piece).all()) for piece in pieces)
-
-
 class ViewIndex:
-    """An open index of view descriptors. Several threads may search it at the same time.
-
-    Attributes:
-        is_finite: False if a descriptor is not finite.
+    """Open descriptors of views. Several threads may search them at the same time.
 
     Args:
-        index: flat FAISS index of inner products.
+        numbers: 8-bit descriptors, a row per view.
     """
 
-    def __init__(self, index: faiss.Index) -> None:
-        self._index = index
-        self.is_finite = _is_finite(index)
-        self._coarse, self._mean = index, np.zeros(index.d, np.float32)
-        if self.is_finite and index.ntotal >= _FEWEST:
-            self._coarse, self._mean = _coarse_copy(index)
+    def __init__(self, numbers: Int8[NDArray[np.int8], "n D"]) -> None:
+        self._numbers = numbers
+        if len(numbers) >= _FEWEST:
+            self._coarse, self._mean = _coarse_copy(numbers)
+        else:
+            self._coarse, self._mean = faiss.IndexFlatIP(numbers.shape[1]), np.zeros(numbers.shape[1], np.float32)
+            self._coarse.add(_vectors_of(numbers))
 
     @classmethod
     def open(cls, path: Path) -> "ViewIndex":
-        """Map an index file into memory and make the coarse copy.
+        """Map the descriptors into memory and make the coarse copy.
 
         FAISS is set to one search thread for the calling thread.
 
         Args:
-            path: file that ``write_index`` wrote.
+            path: file that ``write_descriptors`` wrote.
 
         Raises:
-            BundleError: the file is not a flat index of inner products, or a descriptor is not finite.
+            BundleError: the file is not an array of 8-bit numbers with a row per view.
         """
         search_with_one_thread()
         try:
-            index = faiss.read_index(str(path), faiss.IO_FLAG_MMAP_IFC)
-        except RuntimeError as error:
-            raise BundleError(f"{path}: not a FAISS index; copy or build the bundle again", field=FILE) from error
-        # A downcast index refers to the original index and must not outlive it. So only its type is kept.
-        kind = type(faiss.downcast_index(index))
-        if not issubclass(kind, faiss.IndexFlat) or index.metric_type != faiss.METRIC_INNER_PRODUCT:
+            numbers = np.load(path, allow_pickle=False, mmap_mode="r")
+        except (OSError, *NPY_HEADER_ERRORS) as error:
             raise BundleError(
-                f"{path}: the index is a {kind.__name__}, not a flat inner-product index; build the bundle again",
+                f"{path}: not a valid NPY array ({error}); copy or build the bundle again", field=FILE
+            ) from error
+        if numbers.dtype != np.int8 or numbers.ndim != 2 or not numbers.shape[1] or not numbers.flags["C_CONTIGUOUS"]:
+            raise BundleError(
+                f"{path}: {numbers.dtype} of shape {numbers.shape} instead of int8 with a row per view; copy or build the "
+                "bundle again",
                 field=FILE,
             )
-        found = cls(index)
-        if not found.is_finite:
-            raise BundleError(f"{path}: a descriptor is not finite; copy or build the bundle again", field=FILE)
-        return found
+        return cls(numbers)
 
     def __len__(self) -> int:
-        return int(self._index.ntotal)
+        return len(self._numbers)
 
     @property
     def dimension(self) -> int:
         """Number of components of a descriptor."""
-        return int(self._index.d)
+        return int(self._numbers.shape[1])
 
     def shortlist(self, descriptor: Float32[NDArray[np.float32], " D"], k: int) -> Int64[NDArray[np.int64], " k"]:
         """Return the indices of approximately the k most similar views, in no particular order.
 
-        The search uses the coarse 8-bit copy, if the map has one. The caller then compares the listed views exactly with
+        The search uses the coarse copy, if the map has one. The caller then compares the listed views exactly with
         ``vectors``. The list must be several times longer than the number of wanted views (decision 0046).
 
         Args:
@@ -144,10 +149,9 @@ class ViewIndex:
         return found
 
     def vectors(self, views: Int64[NDArray[np.int64], " n"]) -> Descriptors:
-        """Return the exact descriptors of some views.
+        """Return the descriptors of some views, unit vectors.
 
         Args:
             views: indices of the views.
         """
-        found: Descriptors = self._index.reconstruct_batch(np.ascontiguousarray(views))
-        return found
+        return _vectors_of(self._numbers[views])

@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import asdict
 from datetime import UTC, datetime
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +20,7 @@ from pydantic import ValidationError
 from service.errors import BundleError
 from service.maps import content as parts
 from service.maps import index, manifest, streets
+from service.maps.byte_planes import write_records
 from service.maps.content import BundleContent
 from service.maps.manifest import FORMAT, Counts, FileEntry, GridParameters, Manifest
 
@@ -124,7 +126,7 @@ def _write_files(folder: Path, content: BundleContent) -> Manifest:
     views["place"], views["heading_rad"] = content.view_place, content.view_heading_rad
     writers: dict[str, Callable[[Path], object]] = {
         parts.ENCODER_FILE: lambda path: path.write_bytes(content.encoder),
-        index.FILE: lambda path: index.write_index(path, content.descriptors),
+        index.FILE: lambda path: index.write_descriptors(path, content.descriptors),
         parts.PLACES_FILE: lambda path: np.save(path, places, allow_pickle=False),
         parts.VIEWS_FILE: lambda path: np.save(path, views, allow_pickle=False),
         parts.CALIBRATION_FILE: lambda path: path.write_bytes(_json(content.calibration)),
@@ -134,7 +136,7 @@ def _write_files(folder: Path, content: BundleContent) -> Manifest:
     if content.streets is not None:
         writers[streets.FILE] = lambda path: path.write_bytes(_json(content.streets))
     if content.statistics is not None:
-        writers[parts.STATISTICS_FILE] = _array_writer(content.statistics)
+        writers[parts.STATISTICS_FILE] = partial(write_records, records=content.statistics)
     for name, array in ({} if content.cloud is None else content.cloud.arrays()).items():
         writers[f"{parts.CLOUD_FOLDER}/{name}.npy"] = _array_writer(array)
     for name, write in writers.items():
@@ -210,6 +212,8 @@ def _require_valid(content: BundleContent) -> None:
         what = f"a place refers to a street that is not among the {named} of streets.geojson"
     elif not np.isfinite(content.descriptors).all():
         what = "a descriptor is not finite"
+    elif (np.abs(np.linalg.norm(content.descriptors, axis=1) - 1) > index.LENGTH_OFF).any():
+        what = "a descriptor is not a unit vector"
     elif not parts.are_poses(content.T_map_place):
         what = parts.NO_POSE
     elif wrong := manifest.not_on_earth(content.georeference):

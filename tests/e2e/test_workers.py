@@ -282,12 +282,12 @@ def test_a_damaged_bundle_beside_a_good_one_is_reported_and_nobody_is_kept_from_
     folder: Path, content_of: Callable[..., BundleContent], parts_of: Parts
 ) -> None:
     write_bundle(folder / "bad", content_of(name="west"))
-    (folder / "bad" / "views.faiss").write_bytes(b"short")
+    (folder / "bad" / "descriptors.npy").write_bytes(b"short")
     service = Service(folder)
     try:
         (refused,) = httpx.get(f"{service.url}/readyz", timeout=30).json()["refused"]
         assert refused["bundle"] == "bad"
-        assert refused["reason"].startswith("bad/views.faiss: 5 bytes instead of")
+        assert refused["reason"].startswith("bad/descriptors.npy: 5 bytes instead of")
         assert service.metric("streetfix_bundle_refused", bundle="bad") == 1
         assert post(service.url, parts_of()).status_code == 200
     finally:
@@ -303,7 +303,7 @@ def test_a_damaged_bundle_beside_a_good_one_is_reported_and_nobody_is_kept_from_
         check=False,
     )
     assert strict.returncode == 1
-    assert "views.faiss" in strict.stderr
+    assert "descriptors.npy" in strict.stderr
 
 
 def test_workers_leave_with_their_parent(service: Service) -> None:

@@ -57,7 +57,7 @@ def test_a_shortlist_of_a_large_index_is_as_long_as_wanted():
     rng = np.random.default_rng(0)
 
     class Whole:
-        is_finite, dimension = True, 4
+        dimension = 4
         vectors_of = rng.normal(size=(500, 4)).astype(np.float32)
 
         def __len__(self):

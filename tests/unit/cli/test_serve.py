@@ -19,8 +19,8 @@ def test_no_map_is_refused_with_the_remedy() -> None:
 
 
 def test_a_damaged_map_is_refused_before_anything_listens(bundle_copy: Path) -> None:
-    (bundle_copy / "views.faiss").write_bytes(b"short")
-    with pytest.raises(BundleError, match=r"views\.faiss: 5 bytes instead of"):
+    (bundle_copy / "descriptors.npy").write_bytes(b"short")
+    with pytest.raises(BundleError, match=r"descriptors\.npy: 5 bytes instead of"):
         serve(Settings(maps=(bundle_copy,)))
 
 
@@ -57,10 +57,10 @@ def test_garbage_collection_passes_over_what_was_imported_but_not_over_maps(
 def test_check_names_every_bundle_that_cannot_be_mounted(
     bundle_copy: Path, content_of: Callable[..., BundleContent], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    (bundle_copy / "views.faiss").write_bytes(b"short")
+    (bundle_copy / "descriptors.npy").write_bytes(b"short")
     write_bundle(tmp_path / "good", content_of(name="good"))
     with pytest.raises(
-        BundleError, match=r"1 of the map bundles cannot be mounted: own/views\.faiss: 5 bytes instead of"
+        BundleError, match=r"1 of the map bundles cannot be mounted: own/descriptors\.npy: 5 bytes instead of"
     ):
         check_only(Settings(maps=(tmp_path,)))
     assert "map good" in capsys.readouterr().out

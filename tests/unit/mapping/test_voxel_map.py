@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial import cKDTree
 
-from model_training.mapping.voxel_map import VOXEL, VOXEL_WITHOUT_BRIGHTNESS, VoxelMap, lattice_origin
+from model_training.mapping.voxel_map import VOXEL, VoxelMap, lattice_origin
 from service.errors import DatasetError
 from service.registration.surfel_map import TILE_M
 
@@ -182,18 +182,6 @@ def test_statistics_keep_brightness(cloud):
     one.add_statistics(other.statistics())
     expected = lit(cloud, intensity, origin=near).surfels().brightness
     np.testing.assert_allclose(one.surfels().brightness, expected, atol=1e-6)
-
-
-def test_statistics_of_an_older_map_have_no_brightness(cloud):
-    near = lattice_origin(0.5, np.array([98.0, -50.0, 1.0]))
-    whole = lit(cloud, np.ones(len(cloud)), origin=near).statistics()
-    older = np.zeros(len(whole), VOXEL_WITHOUT_BRIGHTNESS)
-    for name in older.dtype.names or ():
-        older[name] = whole[name]
-    read = VoxelMap(0.5, near)
-    read.add_statistics(older)
-    np.testing.assert_array_equal(read.statistics()["sums"], whole["sums"])
-    assert np.isnan(read.surfels().brightness).all()
 
 
 def test_moments_of_a_group_are_those_of_its_points():

@@ -130,7 +130,7 @@ def test_a_killed_writer_leaves_nothing_under_the_final_name(tmp_path: Path) -> 
         writer.write_bundle(Path(sys.argv[1]), BundleContent(
             name="m", grid=grid, headings=1, spacing_m=1.0, rows_seen=np.ones(2, bool), T_map_place=np.eye(4)[None],
             place_street=np.array([-1], np.int32), view_place=np.array([0], np.int32), view_heading_rad=np.zeros(1),
-            descriptors=np.ones((1, 4), np.float32), encoder=b"x", parameters={"lidar_height_m": 1.8}))
+            descriptors=np.full((1, 4), 0.5, np.float32), encoder=b"x", parameters={"lidar_height_m": 1.8}))
         """
     )
     done = subprocess.run([sys.executable, "-c", program, str(tmp_path / "m")], check=False)
@@ -146,6 +146,7 @@ def test_a_killed_writer_leaves_nothing_under_the_final_name(tmp_path: Path) -> 
         ({"view_place": np.full(48, 12, np.int32)}, "a view refers to a missing place"),
         ({"place_street": np.full(12, 3, np.int32)}, "not among the 3"),
         ({"descriptors": np.full((48, 16), np.nan, np.float32)}, "not finite"),
+        ({"descriptors": np.full((48, 16), 0.5, np.float32)}, "a descriptor is not a unit vector"),
         ({"T_map_place": np.tile(2.0 * np.eye(4), (12, 1, 1))}, "a pose is not finite, scales"),
         ({"parameters": {}}, "lidar_height_m"),
         ({"name": "a/b"}, "name"),

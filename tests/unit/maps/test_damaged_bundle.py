@@ -15,7 +15,7 @@ from service.maps.manifest import Manifest
 from service.maps.reader import MapBundle
 from service.maps.writer import sha256_of
 
-NEEDED = ["encoder.onnx", "views.faiss", "places.npy", "views.npy", "calibration.json"]
+NEEDED = ["encoder.onnx", "descriptors.npy", "places.npy", "views.npy", "calibration.json"]
 FILES = [*NEEDED, "streets.geojson", "cloud/surfels.npy"]
 OUTSIDE = ["../outside.npy", "/etc/passwd", "cloud/../../outside.npy", "a//b", "manifest.json", ""]
 

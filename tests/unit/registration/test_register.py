@@ -4,9 +4,11 @@ from typing import Any
 import numpy as np
 import pytest
 
+from model_training.mapping.voxel_map import lattice_origin
 from service.geometry.rigid import rotation_y, rotation_z, transform_from
 from service.registration.kernel import QueryPoints, SolverOptions, align
 from service.registration.register import Registered, RegistrationSettings, Start, register
+from tests.unit.street_scene import Scene
 
 #: A fixture of two values: grid and surfels, or rotation and position.
 Pair = tuple[Any, Any]
@@ -54,6 +56,35 @@ def test_positions_are_the_maps_wherever_the_surfels_origin_lies(street, surveye
     )
     np.testing.assert_allclose(other.camera_m, one.camera_m, atol=0.01)
     np.testing.assert_allclose(other.camera_m, pose[1], atol=0.03)
+
+
+AWAY_M = np.array([48_000.0, -36_000.0, 300.0])
+
+
+@pytest.mark.parametrize(
+    ("origin_m", "atol_m"),
+    [
+        pytest.param(AWAY_M, 1e-5, id="a map 60 km from the zero of its frame"),
+        pytest.param(0.5 * AWAY_M, 2e-3, id="a town 60 km from another one, with the origin between them"),
+        pytest.param(np.zeros(3), 4e-3, id="the surfels' origin 60 km away"),
+    ],
+)
+def test_far_from_the_origin_a_query_is_registered_as_at_the_origin(
+    street, surveyed, seen, pose: Pair, origin_m, atol_m
+):
+    """A surfel's position has single precision. Its step is 2 mm at 30 km from the surfels' origin, and 4 mm at 60 km."""
+    R, camera_m = pose
+    far = Scene(*zip(street.corners + AWAY_M, street.a, street.b, strict=True)).survey(
+        origin=lattice_origin(0.3, origin_m)
+    )
+    started = {"turned_deg": 4, "moved_m": (1.0, -0.6, 0.1)}
+    one, other = (
+        register(cloud, measured(seen), [start(R, camera_m + away, 0, **started)], HEIGHT_M, RegistrationSettings())[0]
+        for cloud, away in ((surveyed, np.zeros(3)), (far, AWAY_M))
+    )
+    np.testing.assert_allclose(other.camera_m - AWAY_M, one.camera_m, atol=atol_m)
+    np.testing.assert_allclose(other.R_map_level, one.R_map_level, atol=atol_m / 10)
+    assert other.inliers == pytest.approx(one.inliers, abs=0.01)
 
 
 def test_the_best_supported_start_comes_first_and_says_whose_it_was(surveyed, seen, pose: Pair):
