@@ -1,3 +1,4 @@
+import tracemalloc
 from typing import Any
 
 import numpy as np
@@ -6,6 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial import cKDTree
 
+from model_training.mapping.cloud import prepared
 from model_training.mapping.voxel_map import VOXEL, VoxelMap, lattice_origin
 from service.errors import DatasetError
 from service.registration.surfel_map import TILE_M
@@ -182,6 +184,26 @@ def test_statistics_keep_brightness(cloud):
     one.add_statistics(other.statistics())
     expected = lit(cloud, intensity, origin=near).surfels().brightness
     np.testing.assert_allclose(one.surfels().brightness, expected, atol=1e-6)
+
+
+def test_a_cloud_of_two_towns_60_km_apart_takes_what_both_take():
+    near = np.random.default_rng(3).uniform([100, -50, 0], [140, -10, 4], (20_000, 3))
+    far = near + [45_000.0, 40_000.0, 200.0]
+
+    def cost(*towns):
+        voxels = VoxelMap(0.5, lattice_origin(0.5, np.mean([town.mean(axis=0) for town in towns], axis=0)))
+        tracemalloc.start()
+        for town in towns:
+            voxels.add(town)
+        prepared_cloud = prepared(voxels)
+        peak = tracemalloc.get_traced_memory()[1]
+        tracemalloc.stop()
+        assert prepared_cloud is not None
+        return sum(array.nbytes for array in prepared_cloud.arrays().values()), peak
+
+    (one, one_peak), (other, other_peak), (both, peak) = cost(near), cost(far), cost(near, far)
+    assert both < 1.05 * (one + other)
+    assert peak < 1.05 * (one_peak + other_peak)
 
 
 def test_moments_of_a_group_are_those_of_its_points():
