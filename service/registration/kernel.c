@@ -201,7 +201,8 @@ static inline void find_cells(const Grid *g, double at[3][BATCH_SIZE], int64_t c
         part[k] = (int32_t)((x / PART % 2 * 2 + y / PART % 2) * 2 + z / PART % 2);
         bit[k] = (int32_t)((x % PART * PART + y % PART) * PART + z % PART);
     }
-    /* Each loop fetches the memory of the next one, and hardly any branches: whether a cell is filled cannot be predicted. */
+    /* Hardly any loop branches, because whether a cell is filled cannot be predicted. The rows of recent regions are in the cache. Blocks
+     * and entries are fetched ahead. */
     for (int64_t k = 0; k < count; k++) {
         const int32_t entry = recent_entry[k];
         if (recent->key[entry] != keys[k]) {
