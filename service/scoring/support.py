@@ -25,7 +25,7 @@ from service.scoring.similarity import SimilarityScorer
 class SupportWeights:
     """Weights of the support of a candidate, in nats per unit of each score.
 
-    Fitted by a conditional logit over the candidates of queries in the validation cities (decisions 0028, 0082, 0100 and 0154).
+    Fitted by a conditional logit over the candidates of queries in the validation cities (decisions 0028, 0082 and 0100).
 
     Attributes:
         inliers: weight of the share of inliers.
@@ -36,11 +36,11 @@ class SupportWeights:
         brightness_gap: largest support gap to the best candidate at which brightness is computed, nats. Rendering takes time.
     """
 
-    inliers: float = 16.0
-    similarity: float = 44.0
-    likelihood: float = 0.8
+    inliers: float = 20.0
+    similarity: float = 68.0
+    likelihood: float = 2.4
     prior: float = 1.0
-    brightness: float = 72.0
+    brightness: float = 80.0
     brightness_gap: float = 4.0
 
 
