@@ -16,14 +16,16 @@ from model_training.training.loop import Progress, TrainingConfig, device_of, tr
 from model_training.training.processes import joined
 
 
-def loss_gap(one: NDArray[np.float64], other: NDArray[np.float64]) -> float:
+def loss_gap(one: NDArray[np.float64], other: NDArray[np.float64], *, window: int = 1) -> float:
     """Return the greatest relative difference of two loss curves.
 
     Args:
         one: loss of every step (N,).
         other: loss of every step (N,).
+        window: steps of a running mean of both curves, at most N.
     """
-    return float(np.max(np.abs(other - one) / one))
+    means = [np.convolve(curve, np.full(window, 1 / window), mode="valid") for curve in (one, other)]
+    return float(np.max(np.abs(means[1] - means[0]) / means[0]))
 
 
 def main() -> None:

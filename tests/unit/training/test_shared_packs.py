@@ -5,7 +5,9 @@ import pytest
 
 torch = pytest.importorskip("torch", reason="needs the extra `training`")
 
-from model_training.training import processes, shared_packs  # noqa: E402  # after the skip
+import torch.distributed as dist  # noqa: E402  # after the skip
+
+from model_training.training import shared_packs  # noqa: E402
 from model_training.training.packs import PackPlan  # noqa: E402
 from model_training.training.processes import Processes  # noqa: E402
 from model_training.training.shared_packs import make_packs_together  # noqa: E402
@@ -46,9 +48,9 @@ def test_the_processes_share_the_missing_packs_and_wait_for_all(tmp_path, monkey
 
 
 def test_processes_that_see_different_folders_are_refused(tmp_path, monkeypatch):
-    monkeypatch.setattr(processes.dist, "broadcast_object_list", lambda *_: None)
-    monkeypatch.setattr(processes.dist, "barrier", lambda: None)
-    monkeypatch.setattr(processes.dist, "all_reduce", lambda *_: None)
+    monkeypatch.setattr(dist, "broadcast_object_list", lambda *_: None)
+    monkeypatch.setattr(dist, "barrier", lambda: None)
+    monkeypatch.setattr(dist, "all_reduce", lambda *_: None)
     Processes(0, 2).require_shared(tmp_path, "run")
     assert list(tmp_path.iterdir()) == []
     with pytest.raises(DatasetError, match=r"run: .*the processes see different folders"):
@@ -68,7 +70,7 @@ def test_an_error_of_the_first_process_reaches_the_others(monkeypatch):
         done.append(1)
         raise DatasetError("another configuration", field="run")
 
-    monkeypatch.setattr(processes.dist, "broadcast_object_list", broadcast)
+    monkeypatch.setattr(dist, "broadcast_object_list", broadcast)
     for rank in range(2):
         with pytest.raises(DatasetError, match="another configuration"):
             Processes(rank, 2).in_turn(refuse)
