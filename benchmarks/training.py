@@ -4,9 +4,11 @@ Use an idle machine. The speeds include loading and writing, as in the commands.
 """
 
 import argparse
+import json
 import os
 import shutil
 import subprocess
+import sys
 import tempfile
 import time
 from collections.abc import Iterable
@@ -16,6 +18,7 @@ import numpy as np
 import torch
 from torch.nn import functional
 
+from benchmarks.loss_curve import loss_gap
 from benchmarks.report import ROOT, Report
 from model_training.simulation.plan import QueryPlan, SimulationPlan
 from model_training.simulation.simulate import simulate
@@ -30,6 +33,8 @@ from service.imaging.view_grid import ViewGrid
 PAPER_FRAMES, PAPER_EPOCHS, PAPER_MINUTES = 46_741, 4, 138
 #: Seed of training data that no recipe uses.
 BENCH_SEED = 1900
+#: Steps of the running mean in which loss curves are also compared. Rounding errors grow, and single steps scatter.
+LOSS_WINDOW = 10
 
 
 def packs_for_bench(work: Path) -> list[Path]:
@@ -115,6 +120,42 @@ def paper_size(report: Report, packs: list[Path], steps: int) -> None:
     report.row("training.minutes_for_paper_images_224", PAPER_FRAMES * PAPER_EPOCHS / rate / 60, "min", n=steps)
 
 
+def two_processes(report: Report, work: Path, steps: int) -> None:
+    """Add how far the loss curve of two processes under torchrun is from the curve of one process.
+
+    Two threads instead of one change only the order of sums. Their curve shows what rounding alone does.
+
+    Args:
+        report: collects the rows.
+        work: folder of packs and runs.
+        steps: training steps.
+    """
+    packs = make_packs([PackPlan(seed=BENCH_SEED, places=300, queries_a_place=1)], work / "packs", ViewGrid())
+    config = TrainingConfig(steps=steps, pairs=64, shards=2, memory_after=steps // 3)
+    folder = work / "bench-processes"
+    shutil.rmtree(folder, ignore_errors=True)
+    folder.mkdir()
+    (folder / "config.json").write_text(config.model_dump_json())
+    torchrun = ("-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2", "-m", "--")
+    curves = {}
+    for name, threads, start in (("one", 1, ("-m",)), ("processes", 1, torchrun), ("threads", 2, ("-m",))):
+        out = folder / f"{name}.json"
+        options = ["--run", str(folder / name), "--config", str(folder / "config.json"), "--out", str(out), "--packs"]
+        command = [sys.executable, *start, "benchmarks.loss_curve", *options, *map(str, packs)]
+        subprocess.run(command, check=True, cwd=ROOT, env=os.environ | {"OMP_NUM_THREADS": str(threads)})
+        curves[name] = np.array(json.loads(out.read_text()))
+    one = curves["one"]
+    for row, name, bar in (
+        ("train.two_process_loss_gap", "processes", 0.02),
+        # Two threads change only the order of sums.
+        ("train.rounding_loss_gap", "threads", None),
+    ):
+        what = f"greatest relative difference of the loss of one step, {name} against one process; hard negatives in the last two thirds"
+        report.row(row, loss_gap(one, curves[name]), "share", bar=bar, better="lower", n=steps, why=what)
+        mean = loss_gap(one, curves[name], window=LOSS_WINDOW)
+        report.row(f"{row}_mean", mean, "share", better="lower", n=steps, why=f"the same, mean of {LOSS_WINDOW} steps")
+
+
 def simulation(report: Report, work: Path) -> None:
     """Add the rate of frames written to disk: 32 x 1024 scans, and 640 x 480 pairs with JPEG and PNG.
 
@@ -179,20 +220,28 @@ def main() -> None:
     part.add_argument(
         "--no-walls", action="store_true", help="leave out the demo and the tests, which take longest; their rows stay"
     )
-    part.add_argument("--only", choices=WALLS, help="measure only this, on a fresh clone; the other rows stay")
+    part.add_argument(
+        "--only",
+        choices=[*WALLS, "processes"],
+        help="measure only this; the other rows stay. demo and test: on a fresh clone. processes: one process against two",
+    )
     arguments = parser.parse_args()
     arguments.work.mkdir(parents=True, exist_ok=True)
     told = "--no-walls" if arguments.no_walls else f"--only {arguments.only}" if arguments.only else ""
     report = Report("training", "make bench-training" + (f' ARGS="{told}"' if told else ""))
     if arguments.only:
         report.keep_others()
-        walls(report, [arguments.only])
+        if arguments.only == "processes":
+            two_processes(report, arguments.work, arguments.steps)
+        else:
+            walls(report, [arguments.only])
         print(f"written: {report.write()}")
         return
     simulation(report, arguments.work)
     packs = packs_for_bench(arguments.work)
     own_size(report, packs, arguments.work, arguments.steps)
     paper_size(report, packs, 4)
+    two_processes(report, arguments.work, arguments.steps)
     if arguments.no_walls:
         report.keep_others()
     else:

@@ -44,6 +44,18 @@ class Report(Protocol):
         """
 
 
+class _Silent:
+    def __call__(self, stage: str, done: int, total: int, /) -> None:
+        pass
+
+    def describe(self, stage: str, text: str, /) -> None:
+        pass
+
+
+#: Reports nothing: for processes whose progress another process shows.
+SILENT: Report = _Silent()
+
+
 class _Bars:
     def __init__(self, progress: Progress) -> None:
         self._progress = progress

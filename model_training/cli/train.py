@@ -1,15 +1,25 @@
 """``streetfix train``."""
 
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Annotated
 
 import typer
 from rich.console import Console
 
-from model_training.cli.progress import bars
-from model_training.training.loop import Progress, TrainingConfig, device_of, require_start, train
-from model_training.training.packs import make_packs
+from model_training.cli.progress import SILENT, bars
+from model_training.training.loop import (
+    Progress,
+    TrainingConfig,
+    device_of,
+    read_config,
+    require_shards,
+    require_start,
+    train,
+)
+from model_training.training.processes import joined
 from model_training.training.recipe import RECIPES, STOCK_CITIES
+from model_training.training.shared_packs import make_packs_together
 from service.errors import DatasetError
 from service.imaging.view_grid import ViewGrid
 
@@ -33,7 +43,7 @@ def command(
     ] = None,
     packs: Annotated[Path, typer.Option(help="Folder of the simulated training cities.")] = Path("runs/packs"),
     steps: Annotated[int, typer.Option(help="Optimiser steps.", min=1)] = 4000,
-    pairs: Annotated[int, typer.Option(help="Pairs of views per step.", min=2, max=2048)] = 128,
+    pairs: Annotated[int, typer.Option(help="Pairs of views per step, of all processes.", min=2, max=2048)] = 128,
     optimiser: Annotated[str, typer.Option(help="Optimiser: adamw or sgdm. The paper uses sgdm.")] = "adamw",
     rate: Annotated[float, typer.Option(help="Highest learning rate.", min=1e-8, max=1)] = 2e-3,
     turn: Annotated[
@@ -54,8 +64,17 @@ def command(
         ),
     ] = "look-alikes",
     device: Annotated[str, typer.Option(help="Device: auto, cpu or cuda.")] = "auto",
+    shards: Annotated[
+        int | None,
+        typer.Option(
+            help="Parts of a batch with random numbers of their own. At most so many processes can share the batch, and any "
+            "number of them learns the same.  [default: that of the run, or the number of processes]",
+            min=1,
+        ),
+    ] = None,
     workers: Annotated[
-        int | None, typer.Option(help="Processes that simulate.  [default: one per core]", min=1)
+        int | None,
+        typer.Option(help="Processes that simulate, for each training process.  [default: one per core]", min=1),
     ] = None,
 ) -> None:
     """Simulate training cities and train an encoder on them.
@@ -65,6 +84,10 @@ def command(
     \b
     Example, the stock encoder:
       streetfix train --run runs/stock && streetfix export runs/stock --out encoder.onnx
+    \b
+    Example, four processes of one machine that resume up to three times after a failure:
+      torchrun --standalone --nproc-per-node 4 --max-restarts 3 --no-python -- \\
+        streetfix train --run runs/stock
     """
     if recipe not in RECIPES:
         raise DatasetError(f"recipe: {recipe!r} is not valid; choose one of: {', '.join(RECIPES)}", field="recipe")
@@ -78,32 +101,39 @@ def command(
         raise DatasetError(
             f"negatives: {negatives!r} is not valid; choose batch, look-alikes or memory", field="negatives"
         )
-    device_of(device)  # said before an hour of simulation, not after it
-    config = TrainingConfig.model_validate(
-        {
-            "steps": steps,
-            "pairs": pairs,
-            "optimiser": optimiser,
-            "learning_rate": rate,
-            "seed": seed,
-            "turn_deg": turn,
-            "precision": precision,
-            "stale_negatives": negatives == "memory",
-        }
-        | ({} if start_from is None else {"memory_after": 30})  # descriptors of a trained network no longer drift fast
-        | ({"memory_after": None} if negatives == "batch" else {})
-    )
-    if start_from is not None:
-        require_start(start_from, config.encoder)
-    plans = RECIPES[recipe](cities or STOCK_CITIES)
-    grid = ViewGrid(rows=config.encoder.rows, columns=config.encoder.columns)
-    with bars() as report:
-        folders = make_packs(plans, packs, grid, workers=workers, report=report)
+    place = device_of(device)  # said before an hour of simulation, not after it
+    with joined(place) as together:
+        if shards is None:
+            shards = read_config(run).shards if (run / "config.json").exists() else together.count
+        together.wait()  # until all have looked: the first process writes the file later
+        config = TrainingConfig.model_validate(
+            {
+                "steps": steps,
+                "pairs": pairs,
+                "optimiser": optimiser,
+                "learning_rate": rate,
+                "seed": seed,
+                "turn_deg": turn,
+                "precision": precision,
+                "stale_negatives": negatives == "memory",
+                "shards": shards,
+            }
+            | ({} if start_from is None else {"memory_after": 30})  # descriptors of a trained network drift slowly
+            | ({"memory_after": None} if negatives == "batch" else {})
+        )
+        require_shards(config, together.count)
+        if start_from is not None:
+            require_start(start_from, config.encoder)
+        plans = RECIPES[recipe](cities or STOCK_CITIES)
+        grid = ViewGrid(rows=config.encoder.rows, columns=config.encoder.columns)
+        with bars() if together.is_first else nullcontext(SILENT) as report:
+            folders = make_packs_together(plans, packs, grid, together, workers=workers, report=report)
 
-        def show(progress: Progress) -> None:
-            stage = f"loss {progress.loss:.2f} {progress.accuracy:4.0%} {progress.images_per_s:.0f}/s"
-            report("training", progress.step, progress.steps)
-            report.describe("training", stage)
+            def show(progress: Progress) -> None:
+                stage = f"loss {progress.loss:.2f} {progress.accuracy:4.0%} {progress.images_per_s:.0f}/s"
+                report("training", progress.step, progress.steps)
+                report.describe("training", stage)
 
-        train(folders, run, config, device=device, start_from=start_from, report=show)
-    Console().print(f"trained: {run}; next: streetfix export {run} --out encoder.onnx")
+            train(folders, run, config, device=device, start_from=start_from, report=show, together=together)
+    if together.is_first:
+        Console().print(f"trained: {run}; next: streetfix export {run} --out encoder.onnx")

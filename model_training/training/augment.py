@@ -5,6 +5,9 @@ The presets of the evaluation (``simulation.depth_noise``) act on whole images, 
 Only the kinds of error are the same here. The ranges of the parameters are wider.
 """
 
+from collections.abc import Sequence
+
+import numpy as np
 import torch
 from pydantic import BaseModel, ConfigDict
 from torch import Tensor
@@ -90,6 +93,14 @@ class Augmenter:
         self.z_of_range = torch.cos(self.elevation) * torch.cos(self.azimuth)
         # V1 and V2 of eq. 9, from the service.
         self.colour_of_rgb = torch.tensor(IHS_FROM_RGB[1:], dtype=torch.float32, device=device)
+
+    def seed(self, numbers: Sequence[int]) -> None:
+        """Start another sequence of random numbers.
+
+        Args:
+            numbers: non-negative numbers that the sequence depends on.
+        """
+        self._generator.manual_seed(int(np.random.SeedSequence(numbers).generate_state(1)[0]))
 
     def _uniform(self, *shape: int) -> Tensor:
         return torch.rand(*shape, generator=self._generator, device=self.device)

@@ -54,6 +54,41 @@ class Batch:
         return 2 * len(self.query_xy)
 
 
+@dataclass(frozen=True)
+class Choice:
+    """Chosen pairs of a batch, B, before their views are read.
+
+    Attributes:
+        pairs: number of each query in its pack (B), sorted.
+        place: number of the paired place in its pack (B).
+        turn_rad: rotation between the query and its map view (B), radians.
+        queries: poses of the queries (B, 4), as in ``Pack``.
+        places: poses of the places (B, 4), as in ``Pack``.
+    """
+
+    pairs: NDArray[np.int64]
+    place: NDArray[np.int64]
+    turn_rad: NDArray[np.float64]
+    queries: NDArray[np.float64]
+    places: NDArray[np.float64]
+
+    def __len__(self) -> int:
+        return len(self.pairs)
+
+    def __getitem__(self, part: slice) -> "Choice":
+        return Choice(self.pairs[part], self.place[part], self.turn_rad[part], self.queries[part], self.places[part])
+
+    @property
+    def query_xy(self) -> Tensor:
+        """Position of the queries (B, 2), map frame, metres."""
+        return _tensor(self.queries[:, :2])
+
+    @property
+    def survey_xy(self) -> Tensor:
+        """Position of the places (B, 2), map frame, metres."""
+        return _tensor(self.places[:, :2])
+
+
 def open_cities(folders: list[Path], grid: ViewGrid, *, turn_deg: float, pairs: int) -> "list[City]":
     """Open packs. Each pack must fill a batch.
 
@@ -96,42 +131,61 @@ class City:
         self.usable = np.array([k for k, near in enumerate(self._places_near) if near])
 
     def draw(self, pairs: int, rng: np.random.Generator, wanted: NDArray[np.int64] | None = None) -> Batch:
-        """Draw a batch of up to ``pairs`` pairs.
+        """Draw a batch of up to ``pairs`` pairs and read its views.
 
         Args:
             pairs: greatest number of pairs; a pair that is chosen twice counts once.
             rng: source of random numbers.
             wanted: numbers of usable queries that the batch must hold (N,); the rest is random.
         """
-        pack, grid = self.pack, self._grid
+        return self.read(self.choose(pairs, rng, wanted))
+
+    def choose(self, pairs: int, rng: np.random.Generator, wanted: NDArray[np.int64] | None = None) -> Choice:
+        """Choose the pairs of a batch without reading their views.
+
+        Args:
+            pairs: greatest number of pairs; a pair that is chosen twice counts once.
+            rng: source of random numbers.
+            wanted: numbers of usable queries that the batch must hold (N,); the rest is random.
+        """
         first = np.zeros(0, np.int64) if wanted is None else wanted[:pairs]
         others = rng.choice(self.usable, pairs - len(first), replace=False)
         chosen = np.unique(np.concatenate([first, others])).astype(np.int64)
-        place = np.array([rng.choice(self._places_near[k]) for k in chosen])
-        queries, places = pack.queries[chosen], pack.places[place]
+        place = np.array([rng.choice(self._places_near[k]) for k in chosen], np.int64)
         turn = rng.uniform(-self._turn_rad, self._turn_rad, len(chosen))
-        heading = queries[:, 2] + turn - places[:, 2]
+        return Choice(chosen, place, turn, self.pack.queries[chosen], self.pack.places[place])
+
+    def read(self, choice: Choice) -> Batch:
+        """Read the views of chosen pairs.
+
+        Args:
+            choice: B pairs of this city.
+        """
+        pack, grid = self.pack, self._grid
+        chosen, queries, places = choice.pairs, choice.queries, choice.places
+        heading = queries[:, 2] + choice.turn_rad - places[:, 2]
         columns = (
             np.rint((heading[:, None] + grid.azimuths_rad + np.pi) / (2 * np.pi) * grid.around).astype(int)
             % grid.around
         )
 
         def views(panoramas: NDArray[np.generic]) -> NDArray[np.generic]:
-            return np.stack([panoramas[p][:, c] for p, c in zip(place, columns, strict=True)])
-
-        def tensor(array: NDArray[np.generic]) -> Tensor:
-            return torch.from_numpy(np.ascontiguousarray(array)).float()
+            return np.stack([panoramas[p][:, c] for p, c in zip(choice.place, columns, strict=True)])
 
         return Batch(
-            tensor(views(pack.panoramas)),
-            (tensor(views(pack.intensities)) / 255) ** 2,
-            tensor(places[:, 3]),
-            tensor(pack.ranges[chosen]),
-            tensor(pack.rgb[chosen].transpose(0, 3, 1, 2)),
-            tensor(queries[:, 3]),
+            _tensor(views(pack.panoramas)),
+            (_tensor(views(pack.intensities)) / 255) ** 2,
+            _tensor(places[:, 3]),
+            _tensor(pack.ranges[chosen]),
+            _tensor(pack.rgb[chosen].transpose(0, 3, 1, 2)),
+            _tensor(queries[:, 3]),
             torch.from_numpy(np.array(pack.rows_seen)),
-            tensor(places[:, :2]),
-            tensor(queries[:, :2]),
+            choice.survey_xy,
+            choice.query_xy,
             chosen,
             None if pack.seen is None else torch.from_numpy(np.ascontiguousarray(pack.seen[chosen])),
         )
+
+
+def _tensor(array: NDArray[np.generic]) -> Tensor:
+    return torch.from_numpy(np.ascontiguousarray(array)).float()

@@ -4,6 +4,7 @@ import json
 import signal
 import time
 from collections.abc import Callable
+from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from pickle import UnpicklingError
@@ -12,17 +13,20 @@ from typing import Any, Literal
 
 import numpy as np
 import torch
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from torch.nn.parallel import DistributedDataParallel
 from torch.utils.tensorboard import SummaryWriter
 
 from model_training.datasets.files import read_bytes, reading
 from model_training.training.augment import Augmentation, Augmenter
-from model_training.training.batches import Batch, City, open_cities
+from model_training.training.batches import Batch, Choice, City, open_cities
 from model_training.training.encoder_net import EncoderNet, EncoderShape, queries_first
 from model_training.training.from_onnx import net_of, require_shape
 from model_training.training.losses import Side, hardest_triplet, paired_info_nce
 from model_training.training.memory import DescriptorMemory
 from model_training.training.precision import Precision, forward_in
+from model_training.training.processes import ALONE, Processes
+from model_training.training.shared_norm import share_statistics
 from service.errors import DatasetError
 from service.imaging.view_grid import PLANES, ViewGrid
 from service.retrieval.encoder import Encoder
@@ -42,7 +46,7 @@ class TrainingConfig(BaseModel):
 
     Attributes:
         steps: training steps.
-        pairs: pairs per batch.
+        pairs: pairs per batch, of all processes together.
         optimiser: AdamW, or SGD with Nesterov momentum.
         learning_rate: greatest learning rate.
         weight_decay: of the optimiser.
@@ -60,6 +64,8 @@ class TrainingConfig(BaseModel):
         loss: InfoNCE or triplet loss.
         blind: planes (``service.imaging.view_grid.PLANES``) that are set to 0 in queries.
         precision: of the forward pass. bfloat16 takes half the time if the processor supports it.
+        shards: parts of a batch that have their own random numbers. Up to so many processes can share a batch, and any number
+            of processes learns the same.
         encoder: sizes of the encoder.
         augmentation: errors of the views.
     """
@@ -85,6 +91,7 @@ class TrainingConfig(BaseModel):
     loss: Literal["info_nce", "triplet"] = "info_nce"
     blind: tuple[str, ...] = ()
     precision: Precision = "float32"
+    shards: int = Field(default=1, ge=1)
     encoder: EncoderShape = EncoderShape()
     augmentation: Augmentation = Augmentation()
 
@@ -134,11 +141,13 @@ def train(
     save_every: int = 200,
     start_from: Path | None = None,
     report: Callable[[Progress], None] = lambda _: None,
+    together: Processes = ALONE,
 ) -> EncoderNet:
     """Train an encoder on packs.
 
     The folder of the run holds ``config.json``, ``checkpoint.pt`` and the TensorBoard log.
     The first Ctrl-C saves a checkpoint and ends. The same call continues from there.
+    Several processes share each batch. They learn the same as one process with the same ``config``, except for rounding.
 
     Args:
         packs: folders of the training cities.
@@ -148,19 +157,23 @@ def train(
         resume: continue from the checkpoint in ``run`` if there is one.
         save_every: steps between checkpoints.
         start_from: folder of a run, or an exported encoder, whose weights the run starts from.
-        report: called after every step.
+        report: called after every step, in the first process.
+        together: processes that train together; all call this function with the same arguments.
 
     Raises:
-        DatasetError: the folder belongs to another configuration or other cities, or a pack or checkpoint is unusable.
+        DatasetError: the folder belongs to another configuration or other cities, a pack or checkpoint is unusable, or the
+            processes cannot share a batch.
         EncoderError: ``start_from`` is a file, but no encoder of the configured shape.
         KeyboardInterrupt: after the checkpoint was saved.
     """
-    grid, place = ViewGrid(rows=config.encoder.rows, columns=config.encoder.columns), device_of(device)
+    grid = ViewGrid(rows=config.encoder.rows, columns=config.encoder.columns)
+    place = together.device(device_of(device))
+    require_shards(config, together.count)
     if start_from is not None:
         require_start(start_from, config.encoder)
-    run.mkdir(parents=True, exist_ok=True)
-    _keep_config(run, config)
-    _keep_packs(run, packs, start_from)
+    together.require_shared(run, "run")
+    together.in_turn(lambda: _keep_config(run, config))
+    together.in_turn(lambda: _keep_packs(run, packs, start_from))
     torch.manual_seed(config.seed)
     rng = np.random.default_rng(config.seed)
     generator = torch.Generator(device=place).manual_seed(config.seed)
@@ -191,8 +204,12 @@ def train(
         first = int(state["step"])
         for memory, kept in zip(memories, state["memories"], strict=True):
             memory.restore(kept)
+    together.wait()  # no process may replace the checkpoint before all have read it
+    encode = _shared(net, together, place)
 
     def save(step: int) -> None:
+        if not together.is_first:
+            return
         part = checkpoint.with_suffix(".part")
         torch.save(
             {
@@ -209,7 +226,10 @@ def train(
         part.rename(checkpoint)
 
     net.train()
-    with SummaryWriter(str(run / "tensorboard")) as log, _Interrupt() as interrupt:
+    with (
+        SummaryWriter(str(run / "tensorboard")) if together.is_first else nullcontext() as log,
+        _Interrupt() as interrupt,
+    ):
         began, images = time.perf_counter(), 0
         for step in range(first, config.steps):
             _set_rate(optimiser, config, step)
@@ -219,17 +239,21 @@ def train(
             known = memory.recent(step, config.memory_steps) if remembers else np.zeros(0, np.int64)
             if len(known) > config.pairs:
                 seeds = rng.choice(known, min(config.alike_seeds, len(known)), replace=False)
-                wanted = memory.alike(seeds, known, config.alike_each)
-            batch = cities[number].draw(config.pairs, rng, wanted)
-            planes = views_of(batch, augment, place, blind=config.blind)
-            count = len(batch.query_xy)
+                wanted = together.of_first(memory.alike(seeds, known, config.alike_each))
+            choice = cities[number].choose(config.pairs, rng, wanted)
+            bounds = shard_bounds(len(choice), config.shards)
+            planes = _own_views(cities[number], choice, bounds, together, augment, config, step)
+            count = len(planes) // 2
             with forward_in(config.precision, place.type):
-                descriptors = net(planes, queries_first(planes, count))
+                descriptors = encode(planes, queries_first(planes, count))
             descriptors = descriptors.float()
+            of_queries, of_surveys = together.gather(
+                descriptors[:count], descriptors[count:], sizes=_sizes(bounds, together)
+            )
             scale = log_scale.exp().clamp(max=config.largest_scale)
-            q = Side(descriptors[:count], batch.query_xy.to(place))
-            m = Side(descriptors[count:], batch.survey_xy.to(place))
-            earlier = torch.from_numpy(np.setdiff1d(known, batch.pairs) if config.stale_negatives else known[:0]).to(
+            q = Side(of_queries, choice.query_xy.to(place))
+            m = Side(of_surveys, choice.survey_xy.to(place))
+            earlier = torch.from_numpy(np.setdiff1d(known, choice.pairs) if config.stale_negatives else known[:0]).to(
                 place
             )
             losses, first_ones = _LOSSES[config.loss](
@@ -239,13 +263,14 @@ def train(
                 more_queries=Side(memory.queries[earlier], memory.queries_xy[earlier]),
                 more_surveys=Side(memory.surveys[earlier], memory.surveys_xy[earlier]),
             )
-            memory.keep(batch.pairs, q.descriptors, m.descriptors, q.xy, m.xy, step)
+            memory.keep(choice.pairs, q.descriptors, m.descriptors, q.xy, m.xy, step)
             loss = losses.mean()
             optimiser.zero_grad(set_to_none=True)
             loss.backward()  # type: ignore[no-untyped-call]  # torch's own stub leaves it untyped
+            together.average_gradient(log_scale)
             torch.nn.utils.clip_grad_norm_(net.parameters(), config.gradient_norm)
             optimiser.step()
-            images += batch.images
+            images += 2 * len(choice)
             state_now = Progress(
                 step + 1,
                 config.steps,
@@ -253,18 +278,98 @@ def train(
                 float(first_ones.float().mean()),
                 images / (time.perf_counter() - began),
             )
-            report(state_now)
-            if (step + 1) % 10 == 0:
-                log.add_scalar("loss", state_now.loss, step + 1)
-                log.add_scalar("own_view_first", state_now.accuracy, step + 1)
-                log.add_scalar("scale", float(scale.detach()), step + 1)
+            if log is not None:
+                report(state_now)
+                if (step + 1) % 10 == 0:
+                    log.add_scalar("loss", state_now.loss, step + 1)
+                    log.add_scalar("own_view_first", state_now.accuracy, step + 1)
+                    log.add_scalar("scale", float(scale.detach()), step + 1)
             if (step + 1) % save_every == 0 or step + 1 == config.steps:
                 save(step + 1)
-            if interrupt.asked:
+            if together.any(interrupt.asked):
                 save(step + 1)
                 raise KeyboardInterrupt
+    if together.count > 1:  # the caller gets layers that need no other process
+        plain = EncoderNet(config.encoder).to(place)
+        plain.load_state_dict(net.state_dict())
+        net = plain
     trained: EncoderNet = net.eval()
     return trained
+
+
+def require_shards(config: TrainingConfig, processes: int) -> None:
+    """Check that processes can share a batch.
+
+    Args:
+        config: pairs and shards of a batch.
+        processes: number of processes.
+
+    Raises:
+        DatasetError: there are more processes than shards, or a shard could be empty.
+    """
+    if processes > config.shards:
+        raise DatasetError(
+            f"shards: {processes} processes share each batch, but the run has --shards {config.shards}; start no more "
+            f"processes than shards, or train in another --run folder with --shards {processes}",
+            field="shards",
+        )
+    if config.shards > config.pairs // 2:  # a batch without duplicates has at least half of its pairs
+        raise DatasetError(
+            f"shards: a batch of {config.pairs} pairs has at most {config.pairs // 2} shards, not {config.shards}; use more "
+            "--pairs or fewer --shards",
+            field="shards",
+        )
+
+
+def shard_bounds(pairs: int, shards: int) -> list[int]:
+    """Return the first pair of every shard of a batch, and the number of pairs.
+
+    Args:
+        pairs: pairs of the batch.
+        shards: number of shards; their sizes differ by at most 1.
+    """
+    return [k * pairs // shards for k in range(shards + 1)]
+
+
+def _sizes(bounds: list[int], together: Processes) -> list[int]:
+    """Pairs of each process."""
+    return [bounds[shards.stop] - bounds[shards.start] for shards in together.shares(len(bounds) - 1)]
+
+
+def _own_views(
+    city: City,
+    choice: Choice,
+    bounds: list[int],
+    together: Processes,
+    augment: Augmenter,
+    config: TrainingConfig,
+    step: int,
+) -> torch.Tensor:
+    """Augmented planes of the pairs of this process, queries before survey views.
+
+    A batch of one shard takes its random numbers from one sequence. Of several shards, each has a sequence of its own
+    that depends on seed, step and shard. So a pair gets the same errors in any process.
+    """
+    if config.shards == 1:
+        return views_of(city.read(choice), augment, augment.device, blind=config.blind)
+    queries, surveys = [], []
+    for shard in together.shares(config.shards)[together.rank]:
+        augment.seed([config.seed, step, shard])
+        batch = city.read(choice[bounds[shard] : bounds[shard + 1]])
+        planes = views_of(batch, augment, augment.device, blind=config.blind)
+        queries.append(planes[: len(planes) // 2])
+        surveys.append(planes[len(planes) // 2 :])
+    return torch.cat([*queries, *surveys])
+
+
+def _shared(net: EncoderNet, together: Processes, place: torch.device) -> torch.nn.Module:
+    """Return what a step calls for descriptors: the network, or the network with gradients of all processes."""
+    if together.tensors is None:
+        return net
+    share_statistics(net, together.tensors)
+    gpus = [place.index] if place.type == "cuda" else None
+    # All processes have the same running statistics already, because these come from the batches of all processes.
+    return DistributedDataParallel(net, device_ids=gpus, process_group=together.tensors, forward_sync_buffers=False)
 
 
 def require_start(start_from: Path, shape: EncoderShape) -> None:
@@ -449,9 +554,10 @@ def _keep_packs(run: Path, packs: list[Path], start_from: Path | None) -> None:
     else:
         earlier = [f"encoder-{name}" for name in Encoder.open(start_from).trained_on]
     names = earlier + [folder.name for folder in packs]
-    if path.exists() and read_packs(run) != names:
+    if not path.exists():
+        path.write_text(json.dumps(names, indent=1) + "\n")
+    elif read_packs(run) != names:
         raise DatasetError(f"{path} names other cities; choose another --run folder, or remove this one", field="run")
-    path.write_text(json.dumps(names, indent=1) + "\n")
 
 
 def _keep_config(run: Path, config: TrainingConfig) -> None:
