@@ -111,7 +111,7 @@ FAMILIES = (
            _rectified(33.0, 0.5, max_range_m=20.0), fitted=False),
     # RealSense D435 and D455: projected texture, baselines 0.05 and 0.095 m, 69 and 90 degrees in colour.
     Family("d435", CameraPlan(width=640, height=360, horizontal_deg=69.0), 0.6, ("precise",), "os1_64", 1.0, 1.2, _SLOW,
-           depth=DepthParameters(focal_baseline_px_m=23.0, noise_px=0.12, offset_px=0.02, max_range_m=12.0), fitted=False),
+           depth=DepthParameters(focal_baseline_px_m=23.0, noise_px=0.12, offset_px=0.02, max_range_m=12.0)),
     Family("d455", CameraPlan(width=640, height=400, horizontal_deg=87.0), 1.0, ("precise",), "vlp_16", 2.0, 1.6, _SLOW,
            depth=DepthParameters(focal_baseline_px_m=32.0, noise_px=0.12, offset_px=0.02, max_range_m=20.0)),
     # Azure Kinect: time of flight, wide field of view binned, 5.5 m.
