@@ -15,8 +15,8 @@ from service.maps.calibration import RIGHT_M
 
 #: Queries on the street with repeating blocks. It is a kind of street, not of rig, and half of its places cannot be told apart.
 _REPEATING = "repeating"
-#: Rigs whose depth covers some rows only. They have rows, but do not count in ``rigs.worst_within_1_m``.
-APART = ("rings",)
+#: A phone's LiDAR of 5 m, and depth that covers some rows only. They have rows, but do not count in ``rigs.worst_within_1_m``.
+APART = ("iphone", "rings")
 #: Bars of each family, and of the worst one.
 _ECE, _WORST_ECE, _REFUSED, _WRONG, _WITHIN, _WORST_WITHIN, _SIGMA_GAP = 0.05, 0.08, 0.05, 0.01, 0.97, 0.94, 0.05
 
