@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks.plans import unseen_plan
+from benchmarks.plans import height_plan
 from benchmarks.report import Report
 from benchmarks.runs import Runs
 
@@ -35,7 +35,7 @@ def rig_calibration_rows(report: Report, runs: Runs) -> None:
         ValueError: the traversal of the map is shorter than a kilometre.
         CalledProcessError: the command fails.
     """
-    dataset = runs.dataset(unseen_plan(0))
+    dataset = runs.dataset(height_plan(1.5))
     folder = runs.bundle(dataset).path
     steps_m = np.linalg.norm(np.diff(dataset.survey_poses()[:, :2, 3], axis=0), axis=1)
     # A step to the next street is no street.

@@ -64,10 +64,10 @@ _BORDERS = (
     "of the vote gained half a point in four other cities, and nothing here"
 )
 _HEIGHTS = (
-    "Retrieval causes most losses. The height estimate has an error of 0.02 to 0.04 m, and a given height gains nothing. At "
-    "0.2, 0.4 and 3.5 m, 104 of 600 queries have a forced error above 1 m. Only 23 of these have their place among the ten "
-    "neighbours of the answer. 17 right answers are refused, 9 wrong answers are accepted. The training cameras of the encoder "
-    "were 1.2 to 1.9 m high (training/packs.py). Next step: cameras of all heights in training and calibration"
+    "Confidence causes most losses: forced answers within 1 m are 0.93, 0.945, 0.955, 0.975, 0.97 and 0.975 from 0.2 to 3.5 m, and no "
+    "accepted answer is wrong. The default needs a confidence of 0.9 since decision 0149; the rows before that accepted more, and some wrong "
+    "ones. Training on cameras of 0.3 to 3.2 m (decision 0154) raised the forced share at 0.2 m from 0.815 to 0.93. The height estimate has an "
+    "error of 0.02 to 0.04 m, and a given height gains nothing. Next: low and high cameras among the families of the calibration"
 )
 _OVER_BARE = (
     "Medians of runs differ by up to 10 %: full REST 0.97 to 1.13, retrieval REST 1.14 to 1.27, gRPC 1.15 to 1.29. A full "
@@ -163,16 +163,18 @@ WHY_MISSED: dict[str, Reason] = {
         "precise camera, heights cause it. The height error of a map differs between cities (0.015 to 0.022 m in calibration), "
         "but all maps share one floor. Next step: let the map build estimate the errors of the map",
     ),
-    "height.0.2.within_1_m": Reason(0.78, _HEIGHTS),
-    "height.0.2.given.within_1_m": Reason(0.77, _HEIGHTS),
-    "height.0.4.within_1_m": Reason(0.835, _HEIGHTS),
-    "height.0.4.given.within_1_m": Reason(0.845, _HEIGHTS),
-    "height.0.8.within_1_m": Reason(0.94, _HEIGHTS),
-    "height.0.8.given.within_1_m": Reason(0.95, _HEIGHTS),
-    "height.1.5.given.within_1_m": Reason(0.965, _HEIGHTS),
-    "height.2.5.given.within_1_m": Reason(0.965, _HEIGHTS),
-    "height.3.5.within_1_m": Reason(0.78, _HEIGHTS),
-    "height.3.5.given.within_1_m": Reason(0.775, _HEIGHTS),
+    "height.0.2.within_1_m": Reason(0.775, _HEIGHTS),
+    "height.0.2.given.within_1_m": Reason(0.78, _HEIGHTS),
+    "height.0.4.within_1_m": Reason(0.855, _HEIGHTS),
+    "height.0.4.given.within_1_m": Reason(0.855, _HEIGHTS),
+    "height.0.8.within_1_m": Reason(0.85, _HEIGHTS),
+    "height.0.8.given.within_1_m": Reason(0.85, _HEIGHTS),
+    "height.1.5.within_1_m": Reason(0.92, _HEIGHTS),
+    "height.1.5.given.within_1_m": Reason(0.925, _HEIGHTS),
+    "height.2.5.within_1_m": Reason(0.9, _HEIGHTS),
+    "height.2.5.given.within_1_m": Reason(0.905, _HEIGHTS),
+    "height.3.5.within_1_m": Reason(0.885, _HEIGHTS),
+    "height.3.5.given.within_1_m": Reason(0.895, _HEIGHTS),
     "real.kitti_0013.recall_at_1_10m": Reason(
         0.9583333,
         "One of 24 queries misses. With 24 queries the bar allows no miss. Retrieval alone finds 17 within 5 m, and "
