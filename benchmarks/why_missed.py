@@ -255,6 +255,10 @@ WHY_MISSED: dict[str, Reason] = {
     ),
 }
 
+WHY_MISSED["docs.code_blocks_run"] = Reason(
+    0.95,
+    "Two commands of docs/robot.md named no service, so the run started none for them. They name it since this run",
+)
 WHY_MISSED["sequence.landmark.within_1_m"] = Reason(
     0.3055555555555556,
     "All 72 answers are within 1 m when forced, but 50 are AMBIGUOUS: their median confidence is 0.81, and the default needs 0.9 since "
