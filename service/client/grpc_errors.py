@@ -10,7 +10,7 @@ from grpc_status import rpc_status
 
 from service.client.problems import refused
 from service.client.tls import ClientTls, closed_hint, handshake_error
-from service.contract.request_id import REQUEST_ID
+from service.contract.schema import REQUEST_ID
 from service.errors import ForeignServiceError, NoAnswerInTimeError, RefusedError, StreetfixError, UnreachableError
 from service.grpc.generated.streetfix.v1 import localization_pb2 as pb
 

@@ -18,7 +18,6 @@ from service.client.prepare import PreparedRequest
 from service.client.problems import refused
 from service.client.tls import ClientTls, closed_hint, handshake_error, ssl_reason
 from service.contract import schema
-from service.contract.request_id import REQUEST_ID
 from service.errors import ForeignServiceError, NoAnswerInTimeError, RefusedError, RequestError, UnreachableError
 
 A = TypeVar("A")
@@ -262,7 +261,7 @@ def _problem_of(response: httpx.Response) -> RefusedError:
         problem=problem.code,
         status=str(response.status_code),
         field=problem.field or "",
-        request_id=problem.request_id or response.headers.get(REQUEST_ID, ""),
+        request_id=problem.request_id or response.headers.get(schema.REQUEST_ID, ""),
         may_come_back=may_come_back,
         retry_after_s=retry_after_s(response.headers.get("Retry-After")),
     )

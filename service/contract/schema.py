@@ -1,6 +1,8 @@
 """The public contract: requests and answers, for REST as JSON and for gRPC as messages. Angles are in degrees; the core uses radians."""
 
 import math
+import re
+import uuid
 from typing import Annotated, ClassVar, Literal, Self
 
 from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, ValidationInfo, field_validator, model_validator
@@ -33,6 +35,18 @@ MOST_SIDE = 32768
 MOST_COMPONENT = 1e6
 #: Most characters of the token of a belief. A track of eight modes has 1,850.
 MOST_TOKEN = 2048
+#: Name of the request id: header (REST, in any case) and metadata key (gRPC, in lower case).
+REQUEST_ID = "x-request-id"
+_REQUEST_ID_FORM = re.compile(r"[A-Za-z0-9._-]{1,64}")
+
+
+def request_id_of(given: str) -> str:
+    """Return the caller's request id if it is 1 to 64 letters, digits, ``.``, ``_`` or ``-``; else a new one.
+
+    Args:
+        given: id that the caller sent; empty if it sent none.
+    """
+    return given if _REQUEST_ID_FORM.fullmatch(given) else uuid.uuid4().hex
 
 
 class _Strict(BaseModel):

@@ -7,7 +7,7 @@ from time import perf_counter
 
 import grpc
 
-from service.contract.request_id import REQUEST_ID, request_id_of
+from service.contract.schema import REQUEST_ID, request_id_of
 from service.errors import StreetfixError
 from service.grpc.call import Call
 from service.grpc.memory import held_by_call

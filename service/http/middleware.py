@@ -14,7 +14,7 @@ from starlette.datastructures import Headers, MutableHeaders
 from starlette.requests import ClientDisconnect, Request
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from service.contract.request_id import REQUEST_ID, request_id_of
+from service.contract.schema import REQUEST_ID, request_id_of
 from service.errors import ForbiddenError, ForbiddenHostError, ForbiddenOriginError, StreetfixError, UnauthorizedError
 from service.http.problems import internal_error, problem_of, problem_response
 from service.runtime.keys import Caller, KeyRing, presented_key
