@@ -10,9 +10,25 @@ FOLDER = ROOT / "docs" / "decisions"
 INDEX = FOLDER / "index.md"
 #: Topics in the order of the index.
 TOPICS = (
-    "simulator", "import", "map", "imaging", "retrieval", "encoder", "registration", "scoring", "confidence", "covariance", "sequences",
-    "serving", "performance", "security", "evaluation", "comparison", "tools", "platforms",
-)  # fmt: skip
+    "simulator",
+    "import",
+    "map",
+    "imaging",
+    "retrieval",
+    "encoder",
+    "registration",
+    "scoring",
+    "confidence",
+    "covariance",
+    "sequences",
+    "serving",
+    "performance",
+    "security",
+    "evaluation",
+    "comparison",
+    "tools",
+    "platforms",
+)
 _STATUS = re.compile(r"in use|rejected|replaced by \d{4}")
 _FORM = re.compile(
     r"# (?P<number>\d{4})\. (?P<question>.+)\n\n- Date: (?P<date>\d{4}-\d\d-\d\d)\n- Status: (?P<status>.+)\n- Topic: (?P<topic>.+)\n"

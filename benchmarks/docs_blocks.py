@@ -26,9 +26,34 @@ import yaml
 from benchmarks.report import ROOT, Report
 
 #: The README comes first: it makes the dataset and the map that the other pages use.
-PAGES = ("README.md", "start", "survey", "recordings", "maps", "robot", "nav2", "python", "deploy", "serving", "console", "confidence",
-         "measuring", "train", "api", "problems", "formats", "how_it_works", "architecture", "paper", "limits", "faq", "index",
-         "contributing", "development", "decisions/index")  # fmt: skip
+PAGES = (
+    "README.md",
+    "start",
+    "survey",
+    "recordings",
+    "maps",
+    "robot",
+    "nav2",
+    "python",
+    "deploy",
+    "serving",
+    "console",
+    "confidence",
+    "measuring",
+    "train",
+    "api",
+    "problems",
+    "formats",
+    "how_it_works",
+    "architecture",
+    "paper",
+    "limits",
+    "faq",
+    "index",
+    "contributing",
+    "development",
+    "decisions/index",
+)
 KINDS = ("sh", "python", "json", "yaml", "text")
 _MARK = re.compile(r"<!-- (not run|file): (.+) -->")
 #: Addresses in the pages. Free ports replace them here.

@@ -216,7 +216,13 @@ def nonsense(rng: np.random.Generator, preset: str, count: int = 100) -> dict[st
         preset: depth preset, a key of ``DEPTHS``.
         count: queries per kind.
     """
-    drawn: dict[str, Picture] = {"indoor": _room, "blank_wall": _wall, "covered_lens": _covered, "sky": _sky, "noise": _noise}  # fmt: skip
+    drawn: dict[str, Picture] = {
+        "indoor": _room,
+        "blank_wall": _wall,
+        "covered_lens": _covered,
+        "sky": _sky,
+        "noise": _noise,
+    }
     return {kind: [_measured(rng, kind, one, preset) for _ in range(count)] for kind, one in drawn.items()}
 
 

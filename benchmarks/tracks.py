@@ -49,9 +49,14 @@ def _displaced_rows(report: Report, found: Tracks) -> None:
     after, wrong = found.epoch[placed, BEFORE:] > found.epoch[placed, BEFORE - 1 : BEFORE], found.wrong(RIGHT_M)
     noticed = np.where(after.any(axis=1), after.argmax(axis=1) + 1, after.shape[1] + 1)
     report.row(
-        "filter.kidnapped.noticed_frames", float(np.median(noticed)) if len(noticed) else None, "frames", bar=3, better="lower",
-        n=len(noticed), why=None if len(noticed) else "no robot was LOCALIZED before it was carried away",
-    )  # fmt: skip
+        "filter.kidnapped.noticed_frames",
+        float(np.median(noticed)) if len(noticed) else None,
+        "frames",
+        bar=3,
+        better="lower",
+        n=len(noticed),
+        why=None if len(noticed) else "no robot was LOCALIZED before it was carried away",
+    )
     report.share("filter.kidnapped.noticed_within_3", noticed <= 3)
     report.share("filter.kidnapped.wrong_and_accepted", wrong[placed, BEFORE:].ravel(), better="lower")
     report.share("filter.kidnapped.last_frame", found.right(RIGHT_M)[placed, -1])

@@ -314,7 +314,7 @@ _RIGS = {
         "OAK-D with semi-global matching, 0.5 m above the ground: at 33 px m an error of 0.25 px is 0.8 m at 10 m. Training on random rigs "
         "raised it from 0.03 to 0.15 (decision 0154). Of the rigs that the calibration is fitted to, the D435 has the least (0.62)"
     ),
-}  # fmt: skip
+}
 #: Values of these rows.
 _RIG_VALUES = {
     "rigs.car.covariance_95_coverage": 0.8818380743982495,

@@ -208,15 +208,34 @@ class Chaos:
             return "free disk"
         oracle, shelf = self._oracle, self._shelf
         possible = {
-            "add": 10, "damage": 4 * (len(shelf.damaged) < _MOST_DAMAGED), "clear damaged": 3 * bool(shelf.damaged),
-            "begin copy": 4 * (len(shelf.halves) < _MOST_HALVES), "finish copy": 4 * bool(shelf.halves),
-            "drop copy": 1 * bool(shelf.halves), "stash": 6 * (len(oracle.on_disk) > 1), "restore": 6 * bool(shelf.stashed),
-            "delete": 4 * (len(oracle.on_disk) > 1), "choose": 12 * (len(oracle.open) > 1), "choose unknown": 2, "sighup": 6,
-            "sighup often": 2, "kill": 9, "kill several": 2, "kill all": 1, "restart": 3, "restart at once": 1,
-            "slow": 4, "abort": 4, "release": 3 * bool(self._sockets), "fill disk": 3 * (not self._disk.is_full),
-            "free disk": 6 * self._disk.is_full, "new keys": 5, "more keys": 3,
-            "broken keys": 2 * (not self._keys_are_broken), "stream": 3,
-        }  # fmt: skip
+            "add": 10,
+            "damage": 4 * (len(shelf.damaged) < _MOST_DAMAGED),
+            "clear damaged": 3 * bool(shelf.damaged),
+            "begin copy": 4 * (len(shelf.halves) < _MOST_HALVES),
+            "finish copy": 4 * bool(shelf.halves),
+            "drop copy": 1 * bool(shelf.halves),
+            "stash": 6 * (len(oracle.on_disk) > 1),
+            "restore": 6 * bool(shelf.stashed),
+            "delete": 4 * (len(oracle.on_disk) > 1),
+            "choose": 12 * (len(oracle.open) > 1),
+            "choose unknown": 2,
+            "sighup": 6,
+            "sighup often": 2,
+            "kill": 9,
+            "kill several": 2,
+            "kill all": 1,
+            "restart": 3,
+            "restart at once": 1,
+            "slow": 4,
+            "abort": 4,
+            "release": 3 * bool(self._sockets),
+            "fill disk": 3 * (not self._disk.is_full),
+            "free disk": 6 * self._disk.is_full,
+            "new keys": 5,
+            "more keys": 3,
+            "broken keys": 2 * (not self._keys_are_broken),
+            "stream": 3,
+        }
         if len(oracle.on_disk) >= _MOST_BUNDLES:
             possible |= {"add": 0, "restore": 0, "finish copy": 0, "delete": 15}
         if self._disk.is_full:  # a killed worker may fail to restart before there is space
@@ -503,13 +522,34 @@ class Chaos:
         return step
 
     _actions: dict[str, Callable[["Chaos"], Step]] = {  # noqa: RUF012  # never changed
-        "add": _add, "restore": _restore, "finish copy": _finish_copy, "damage": _damage, "clear damaged": _clear_damaged,
-        "begin copy": _begin_copy, "drop copy": _drop_copy, "stash": _stash, "delete": _delete, "sighup": _sighup,
-        "sighup often": _sighup_often, "choose": _choose_version, "choose unknown": _choose_unknown, "kill": _kill_one,
-        "kill several": _kill_several, "kill all": _kill_all, "restart": _restart, "restart at once": _restart_at_once,
-        "slow": _slow, "abort": _abort, "release": _release, "fill disk": _fill_disk, "free disk": _free_disk,
-        "new keys": _new_keys, "more keys": _more_keys, "broken keys": _break_keys, "stream": _stream,
-    }  # fmt: skip
+        "add": _add,
+        "restore": _restore,
+        "finish copy": _finish_copy,
+        "damage": _damage,
+        "clear damaged": _clear_damaged,
+        "begin copy": _begin_copy,
+        "drop copy": _drop_copy,
+        "stash": _stash,
+        "delete": _delete,
+        "sighup": _sighup,
+        "sighup often": _sighup_often,
+        "choose": _choose_version,
+        "choose unknown": _choose_unknown,
+        "kill": _kill_one,
+        "kill several": _kill_several,
+        "kill all": _kill_all,
+        "restart": _restart,
+        "restart at once": _restart_at_once,
+        "slow": _slow,
+        "abort": _abort,
+        "release": _release,
+        "fill disk": _fill_disk,
+        "free disk": _free_disk,
+        "new keys": _new_keys,
+        "more keys": _more_keys,
+        "broken keys": _break_keys,
+        "stream": _stream,
+    }
 
     # Checks.
 

@@ -36,13 +36,23 @@ LIMITS = ImageLimits(max_bytes=2**20, max_pixels=2**20)
 CAMERA = PinholeCamera(64, 48, 32.0, 32.0, 31.5, 23.5)
 _DOCUMENT = {
     "camera": {
-        "width": 64, "height": 48, "fx": 32, "fy": 32, "cx": 31.5, "cy": 23.5, "height_m": 0.3, "height_std_m": 0.02,
-        "distortion": [-0.1, 0.02, 0.001, 0], "distortion_model": "brown_conrady",
+        "width": 64,
+        "height": 48,
+        "fx": 32,
+        "fy": 32,
+        "cx": 31.5,
+        "cy": 23.5,
+        "height_m": 0.3,
+        "height_std_m": 0.02,
+        "distortion": [-0.1, 0.02, 0.001, 0],
+        "distortion_model": "brown_conrady",
     },
     "depth": {"scale_m": 0.001, "kind": "disparity", "encoding": "auto", "baseline_m": 0.12, "max_range_m": 40},
-    "gravity": {"x": 0, "y": 9.8, "z": 0.1}, "map": "tiny@1", "options": {"neighbours": 5, "refine": True, "false_accept_rate": 0.01},
+    "gravity": {"x": 0, "y": 9.8, "z": 0.1},
+    "map": "tiny@1",
+    "options": {"neighbours": 5, "refine": True, "false_accept_rate": 0.01},
     "prior": {"position": {"x": 1, "y": 2, "std_m": 3}, "heading_deg": 10, "heading_std_deg": 20},
-}  # fmt: skip
+}
 
 
 @dataclass(frozen=True)
@@ -212,8 +222,16 @@ def _png_rows(data: bytes) -> None:
 
 
 def _oscp_seed() -> bytes:
-    camera = {"sensorId": "c", "timestamp": 1, "privacy": {}, "sequenceNumber": 1, "imageFormat": "RGBA32", "size": [64, 48],
-              "imageBytes": "AAAA", "params": {"model": "PINHOLE", "modelParams": [32, 32, 31.5, 23.5]}}  # fmt: skip
+    camera = {
+        "sensorId": "c",
+        "timestamp": 1,
+        "privacy": {},
+        "sequenceNumber": 1,
+        "imageFormat": "RGBA32",
+        "size": [64, 48],
+        "imageBytes": "AAAA",
+        "params": {"model": "PINHOLE", "modelParams": [32, 32, 31.5, 23.5]},
+    }
     depth = camera | {"imageFormat": "DEPTH", "sensorId": "d"}
     readings = {"cameraReadings": [camera, depth], "accelerometerReadings": [{"x": 0, "y": 9.8, "z": 0}]}
     return json.dumps(

@@ -16,9 +16,18 @@ from elftools.elf.sections import SymbolTableSection
 
 #: The first x86-64 processors have x87, CMOV, MMX, SSE and SSE2. The other groups here are no extensions.
 _BASELINE_GROUPS = {
-    x86.X86_GRP_JUMP, x86.X86_GRP_CALL, x86.X86_GRP_RET, x86.X86_GRP_INT, x86.X86_GRP_BRANCH_RELATIVE, x86.X86_GRP_MODE64,
-    x86.X86_GRP_CMOV, x86.X86_GRP_MMX, x86.X86_GRP_SSE1, x86.X86_GRP_SSE2, x86.X86_GRP_FPU,
-}  # fmt: skip
+    x86.X86_GRP_JUMP,
+    x86.X86_GRP_CALL,
+    x86.X86_GRP_RET,
+    x86.X86_GRP_INT,
+    x86.X86_GRP_BRANCH_RELATIVE,
+    x86.X86_GRP_MODE64,
+    x86.X86_GRP_CMOV,
+    x86.X86_GRP_MMX,
+    x86.X86_GRP_SSE1,
+    x86.X86_GRP_SSE2,
+    x86.X86_GRP_FPU,
+}
 _BASELINE = frozenset(
     """adc add and bsf bsr bswap bt btc btr bts cbw cdq cdqe cld cmp cmpsb cmpsq cmpxchg cpuid cqo cvtsi2sd cvtsi2ss cwd cwde dec
     div endbr64 hlt idiv imul inc int3 lea leave lodsb lodsq mov movabs movsb movsd movsq movsw movsx movsxd movzx mul neg nop not

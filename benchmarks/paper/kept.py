@@ -58,11 +58,18 @@ class MethodResult:
         """
         folder.mkdir(parents=True, exist_ok=True)
         told = {
-            "method": self.method, "run": self.run.as_json(), "training_s": self.training_s, "images": self.images,
-            "training_set": self.training_set, "ended": self.ended, "extra": self.extra,
+            "method": self.method,
+            "run": self.run.as_json(),
+            "training_s": self.training_s,
+            "images": self.images,
+            "training_set": self.training_set,
+            "ended": self.ended,
+            "extra": self.extra,
             "curve": [[p.images, p.processor_s, p.loss, p.score] for p in self.curve],
-            "answers": {name: {"xy": _plain(each.xy), "street": each.street.tolist()} for name, each in self.answers.items()},
-        }  # fmt: skip
+            "answers": {
+                name: {"xy": _plain(each.xy), "street": each.street.tolist()} for name, each in self.answers.items()
+            },
+        }
         part = folder / f"{self.method}.part"
         part.write_text(json.dumps(told) + "\n")
         part.rename(folder / f"{self.method}.json")

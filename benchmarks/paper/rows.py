@@ -23,8 +23,15 @@ from research.baselines.regression.locate import STAGES
 #: Number of images that the paper's 84 iterations show: four times 70 % of its frames.
 PAPER_IMAGES = round(4 * 0.7 * 46_741)
 METHODS = (
-    "streetfix", "cnn_knn", "cnn_softmax", "icp_pointnetlk_googlenet", "scan_context", "raw_range", "dual_encoder", "fov_encoder",
-)  # fmt: skip
+    "streetfix",
+    "cnn_knn",
+    "cnn_softmax",
+    "icp_pointnetlk_googlenet",
+    "scan_context",
+    "raw_range",
+    "dual_encoder",
+    "fov_encoder",
+)
 #: Our methods that are trained on the comparison's data. They must lead.
 TRAINED_BY_US = ("streetfix", "streetfix_as_paper")
 #: Methods whose training has another name in ``Pace``.

@@ -54,9 +54,10 @@ def native_rows(report: Report, work: Path) -> None:
         dataset = runs.dataset(native_plan())
         bundle = runs.bundle(dataset)
         asked = [
-            "-m", "benchmarks.native.answers", "--map", str(bundle.path.resolve()), "--dataset", str(dataset.folder.resolve()),
-            "--queries", "drive1_stereo", "--count", str(QUERIES),
-        ]  # fmt: skip
+            *("-m", "benchmarks.native.answers"),
+            *("--map", str(bundle.path.resolve()), "--dataset", str(dataset.folder.resolve())),
+            *("--queries", "drive1_stereo", "--count", str(QUERIES)),
+        ]
         by_gcc = build_wheel(Path(folder) / "gcc", "gcc")
         answers = []
         for unpacked in (by_zig, by_gcc):

@@ -43,8 +43,15 @@ _CAPACITY_S, _SAMPLE_S, _SCRAPE_S, _TELL_S, _WRITE_S, _TIMEOUT_S = 20.0, 10.0, 1
 _FRAMES = 3  # frames of a sequence, and requests of a batch
 _STREAM_FRAMES = 60
 #: Weight of each kind of request, and the number of image pairs that it contains.
-_MIX = {"rest": (38, 1), "grpc": (26, 1), "stream": (18, 1), "sequence": (3, _FRAMES), "batch": (3, _FRAMES),
-        "refused": (6, 0), "listing": (6, 0)}  # fmt: skip
+_MIX = {
+    "rest": (38, 1),
+    "grpc": (26, 1),
+    "stream": (18, 1),
+    "sequence": (3, _FRAMES),
+    "batch": (3, _FRAMES),
+    "refused": (6, 0),
+    "listing": (6, 0),
+}
 
 
 @dataclass

@@ -26,19 +26,32 @@ from service.localization.localizer import Localizer
 from service.maps.reader import MapBundle
 
 SHOWN = (
-    ("queries", "queries", "{:d}"), ("localized", "accepted", "{:.2%}"), ("accepted_wrong", "accepted, over 1 m off", "{:.2%}"),
-    ("median_confidence", "median confidence", "{:.3f}"), ("street_accuracy", "accepted, street right", "{:.2%}"),
-    ("within_0_5_m", "accepted, within 0.5 m", "{:.2%}"), ("within_1_m", "accepted, within 1 m", "{:.2%}"),
-    ("within_5_m", "accepted, within 5 m", "{:.2%}"), ("mean_distance_error_m", "accepted, mean error", "{:.3f} m"),
-    ("median_distance_error_m", "accepted, median error", "{:.3f} m"), ("p95_distance_error_m", "accepted, 95th percentile", "{:.3f} m"),
-    ("rms_distance_error_m", "accepted, RMS error", "{:.3f} m"), ("mse_m2", "accepted, MSE", "{:.3f} m2"),
+    ("queries", "queries", "{:d}"),
+    ("localized", "accepted", "{:.2%}"),
+    ("accepted_wrong", "accepted, over 1 m off", "{:.2%}"),
+    ("median_confidence", "median confidence", "{:.3f}"),
+    ("street_accuracy", "accepted, street right", "{:.2%}"),
+    ("within_0_5_m", "accepted, within 0.5 m", "{:.2%}"),
+    ("within_1_m", "accepted, within 1 m", "{:.2%}"),
+    ("within_5_m", "accepted, within 5 m", "{:.2%}"),
+    ("mean_distance_error_m", "accepted, mean error", "{:.3f} m"),
+    ("median_distance_error_m", "accepted, median error", "{:.3f} m"),
+    ("p95_distance_error_m", "accepted, 95th percentile", "{:.3f} m"),
+    ("rms_distance_error_m", "accepted, RMS error", "{:.3f} m"),
+    ("mse_m2", "accepted, MSE", "{:.3f} m2"),
     ("median_heading_error_deg", "accepted, median heading error", "{:.2f} deg"),
-    ("forced.within_0_5_m", "forced, within 0.5 m", "{:.2%}"), ("forced.within_1_m", "forced, within 1 m", "{:.2%}"),
-    ("forced.within_5_m", "forced, within 5 m", "{:.2%}"), ("forced.median_distance_error_m", "forced, median error", "{:.3f} m"),
-    ("forced.p95_distance_error_m", "forced, 95th percentile", "{:.3f} m"), ("recall_at_1_5m", "R@1 at 5 m", "{:.2%}"),
-    ("recall_at_5_5m", "R@5 at 5 m", "{:.2%}"), ("recall_at_10_5m", "R@10 at 5 m", "{:.2%}"), ("recall_at_1_10m", "R@1 at 10 m", "{:.2%}"),
-    ("raw_recall_at_1_5m", "raw range image R@1", "{:.2%}"), ("ms_per_query", "time per query", "{:.1f} ms"),
-)  # fmt: skip
+    ("forced.within_0_5_m", "forced, within 0.5 m", "{:.2%}"),
+    ("forced.within_1_m", "forced, within 1 m", "{:.2%}"),
+    ("forced.within_5_m", "forced, within 5 m", "{:.2%}"),
+    ("forced.median_distance_error_m", "forced, median error", "{:.3f} m"),
+    ("forced.p95_distance_error_m", "forced, 95th percentile", "{:.3f} m"),
+    ("recall_at_1_5m", "R@1 at 5 m", "{:.2%}"),
+    ("recall_at_5_5m", "R@5 at 5 m", "{:.2%}"),
+    ("recall_at_10_5m", "R@10 at 5 m", "{:.2%}"),
+    ("recall_at_1_10m", "R@1 at 10 m", "{:.2%}"),
+    ("raw_recall_at_1_5m", "raw range image R@1", "{:.2%}"),
+    ("ms_per_query", "time per query", "{:.1f} ms"),
+)
 _CAPTION = (
     "accepted: status LOCALIZED, shares of all queries; forced: the best guess of every query, whatever its status"
 )

@@ -150,12 +150,20 @@ def command(
         settings or []
     )
     of_all: dict[str, object] = {
-        "depths": tuple(depth or ["precise"]), "condition": condition, "turn_deg": turn, "pitch_deg": pitch,
-        "blocked": blocked, "followed": followed, "max_depth_m": max_depth, "depth_parameters": depth_parameters,
+        "depths": tuple(depth or ["precise"]),
+        "condition": condition,
+        "turn_deg": turn,
+        "pitch_deg": pitch,
+        "blocked": blocked,
+        "followed": followed,
+        "max_depth_m": max_depth,
+        "depth_parameters": depth_parameters,
         "stereo_parameters": stereo_parameters,
-        "rgb": None if rgb == "automatic" else rgb, "rgb_parameters": rgb_parameters,
-        "sun_elevation_deg": sun_elevation, "sun_azimuth_deg": sun_azimuth,
-    }  # fmt: skip
+        "rgb": None if rgb == "automatic" else rgb,
+        "rgb_parameters": rgb_parameters,
+        "sun_elevation_deg": sun_elevation,
+        "sun_azimuth_deg": sun_azimuth,
+    }
     of_drives: dict[str, object] = {"parked_changed": parked_changed, "aside_m": aside, "heading_deg": heading}
     plans = []
     if queries or table1:

@@ -8,9 +8,20 @@ from rich.table import Table
 from model_training.evaluation.stages import MEANING, QueryStages, lost_by_stage
 
 _HEAD = (
-    "query", "tilt", "height", "place rank", "start", "candidate", "from truth", "inliers at truth", "error", "heading", "status",
-    "confidence", "lost by",
-)  # fmt: skip
+    "query",
+    "tilt",
+    "height",
+    "place rank",
+    "start",
+    "candidate",
+    "from truth",
+    "inliers at truth",
+    "error",
+    "heading",
+    "status",
+    "confidence",
+    "lost by",
+)
 #: Columns that a row takes.
 WIDTH = 120
 

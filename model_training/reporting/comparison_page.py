@@ -21,10 +21,17 @@ _SHOWN = 20
 #: Error of a query without an answer when changes are sorted, metres.
 _FAR_M = 1e6
 LABELS = {
-    "within_0_5_m": "accepted, within 0.5 m", "within_1_m": "accepted, within 1 m", "within_5_m": "accepted, within 5 m",
-    "forced_within_0_5_m": "forced, within 0.5 m", "forced_within_1_m": "forced, within 1 m", "recall_at_1_5m": "R@1 at 5 m",
-    "recall_at_5_5m": "R@5 at 5 m", "recall_at_10_5m": "R@10 at 5 m", "localized": "accepted", "accepted_but_wrong": "accepted, wrong",
-}  # fmt: skip
+    "within_0_5_m": "accepted, within 0.5 m",
+    "within_1_m": "accepted, within 1 m",
+    "within_5_m": "accepted, within 5 m",
+    "forced_within_0_5_m": "forced, within 0.5 m",
+    "forced_within_1_m": "forced, within 1 m",
+    "recall_at_1_5m": "R@1 at 5 m",
+    "recall_at_5_5m": "R@5 at 5 m",
+    "recall_at_10_5m": "R@10 at 5 m",
+    "localized": "accepted",
+    "accepted_but_wrong": "accepted, wrong",
+}
 
 
 def write_comparison_page(

@@ -175,8 +175,14 @@ class City:
                 outer = [e + normal * (half + pavement) for e in ends]
                 quad = np.array([[*p, self.height(*p) + 0.13] for p in (inner[0], inner[1], outer[1], outer[0])])
                 foot = quad[:2] - [0, 0, 0.2]
-                faces = np.array([[quad[0], quad[1], quad[2]], [quad[0], quad[2], quad[3]],
-                                  [foot[0], foot[1], quad[1]], [foot[0], quad[1], quad[0]]])  # fmt: skip
+                faces = np.array(
+                    [
+                        [quad[0], quad[1], quad[2]],
+                        [quad[0], quad[2], quad[3]],
+                        [foot[0], foot[1], quad[1]],
+                        [foot[0], quad[1], quad[0]],
+                    ]
+                )
                 builder.triangles(faces, np.array([0.36, 0.35, 0.33]), Material.GROUND)
 
     def _houses(

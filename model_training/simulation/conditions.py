@@ -68,14 +68,36 @@ CONDITIONS = {
         # A clear day among tall houses and trees: shaded surfaces see little of the sky. With this ``ambient`` the errors of stereo
         # matching are like those of KITTI drive 0005 (decision 0138).
         Condition("hard_light", ambient=0.45),
-        Condition("rain", 1.076 * 25**0.67 * _PER_METRE, 0.024, 4.0, wet=0.8, sun_strength=0.0, ambient=0.8, streaks=0.5,
-                  disparity_noise=1.4, holes=0.25),
-        Condition("snow", 5.50 * 2**1.38 * _PER_METRE, 0.08, 6.0, snow_cover=0.7, sun_strength=0.0, ambient=0.9, streaks=1.0,
-                  disparity_noise=1.5, holes=0.35),
+        Condition(
+            "rain",
+            1.076 * 25**0.67 * _PER_METRE,
+            0.024,
+            4.0,
+            wet=0.8,
+            sun_strength=0.0,
+            ambient=0.8,
+            streaks=0.5,
+            disparity_noise=1.4,
+            holes=0.25,
+        ),
+        Condition(
+            "snow",
+            5.50 * 2**1.38 * _PER_METRE,
+            0.08,
+            6.0,
+            snow_cover=0.7,
+            sun_strength=0.0,
+            ambient=0.9,
+            streaks=1.0,
+            disparity_noise=1.5,
+            holes=0.35,
+        ),
         Condition("fog", 3.912 / 50, 0.16, 5.0, sun_strength=0.0, ambient=0.9, disparity_noise=1.8, holes=0.3),
         # Real night light of 1 lux is 1/10,000 of a cloudy day. With a long exposure and the gain at its limit, an image is as dark
         # and noisy as one at 1/80 of daylight with a daytime exposure. We render the latter.
         Condition("night", sun_strength=0.0, ambient=0.012, headlights=True, disparity_noise=1.8, holes=0.5),
-        Condition("low_sun", sun_elevation_deg=6.0, sun_strength=1.3, ambient=0.7, glare=1.0, disparity_noise=1.2, holes=0.2),
+        Condition(
+            "low_sun", sun_elevation_deg=6.0, sun_strength=1.3, ambient=0.7, glare=1.0, disparity_noise=1.2, holes=0.2
+        ),
     )
-}  # fmt: skip
+}

@@ -13,10 +13,26 @@ from model_training.streets.named_street import LARGEST_M, Lanes
 from model_training.streets.plan_view import STEP_M, Along, Geometry, Points, reference_line
 
 #: OpenDRIVE's lane types that vehicles drive on.
-DRIVEN = frozenset({
-    "driving", "entry", "exit", "onRamp", "offRamp", "slipLane", "connectingRamp", "bidirectional", "bus", "taxi", "HOV",
-    "mwyEntry", "mwyExit", "roadWorks", "tram", "stop",
-})  # fmt: skip
+DRIVEN = frozenset(
+    {
+        "driving",
+        "entry",
+        "exit",
+        "onRamp",
+        "offRamp",
+        "slipLane",
+        "connectingRamp",
+        "bidirectional",
+        "bus",
+        "taxi",
+        "HOV",
+        "mwyEntry",
+        "mwyExit",
+        "roadWorks",
+        "tram",
+        "stop",
+    }
+)
 #: Lane types that are no part of a road: "none" is the ground outside of it.
 NOWHERE = frozenset({"none"})
 #: Grid of the surfaces, metres. Adjacent strips differ by rounding errors; on this grid they meet exactly.

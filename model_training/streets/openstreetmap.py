@@ -22,10 +22,24 @@ from service.errors import DatasetError
 
 #: Carriageway width (m) by class, most important class first: at a crossing the more important street keeps the ground.
 CLASS_WIDTHS_M = {
-    "motorway": 11.0, "trunk": 10.0, "primary": 9.0, "secondary": 8.0, "tertiary": 7.0, "unclassified": 6.0, "residential": 6.0,
-    "living_street": 5.0, "pedestrian": 6.0, "motorway_link": 5.0, "trunk_link": 5.0, "primary_link": 5.0, "secondary_link": 5.0,
-    "tertiary_link": 5.0, "road": 6.0, "busway": 6.0, "service": 4.0,
-}  # fmt: skip
+    "motorway": 11.0,
+    "trunk": 10.0,
+    "primary": 9.0,
+    "secondary": 8.0,
+    "tertiary": 7.0,
+    "unclassified": 6.0,
+    "residential": 6.0,
+    "living_street": 5.0,
+    "pedestrian": 6.0,
+    "motorway_link": 5.0,
+    "trunk_link": 5.0,
+    "primary_link": 5.0,
+    "secondary_link": 5.0,
+    "tertiary_link": 5.0,
+    "road": 6.0,
+    "busway": 6.0,
+    "service": 4.0,
+}
 #: Width of a lane, metres.
 LANE_M = 3.25
 #: Width of a pavement, metres. With ``lanes`` "all" each side gets one, unless the tags or the class say otherwise.

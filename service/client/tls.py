@@ -208,20 +208,41 @@ def handshake_error(address: str, reason: str) -> HandshakeError | None:
 
 #: Parts of messages of OpenSSL (REST) and BoringSSL (gRPC), and the remedy. The first match applies.
 _REMEDIES = (
-    (("wrong_version_number", "wrong version number", "record layer failure"),
-     "the server does not use TLS on this port: check the port, or connect without TLS (http://)"),
-    (("hostname mismatch", "ip address mismatch", "hostname verification", "is not valid for", "is not in peer certificate"),
-     "the certificate is for another name: connect by a name in the certificate, or add this name to the certificate"),
-    (("certificate has expired", "not yet valid"),
-     "the certificate is not valid now: renew it, and check the clocks of both machines"),
-    (("certificate_verify_failed", "certificate verify failed"),
-     f"no trusted authority has signed the certificate: pass the certificate of its authority with --ca, ca= or {CA}"),
-    (("certificate_required", "certificate required", "peer_did_not_return"),
-     f"the service requires a client certificate: pass --cert and --key, cert= and key=, or {CERT} and {KEY}"),
-    (("alert_unknown_ca", "alert unknown ca", "alert_bad_certificate", "alert bad certificate", "alert_certificate"),
-     "the service does not accept the client certificate: pass one that its authority (STREETFIX_TLS_CLIENT_CA) has signed"),
-    (("ssl_error_ssl", "tls handshake", "ssl handshake", "[ssl"), "check the address, and the TLS settings of both sides"),
-)  # fmt: skip
+    (
+        ("wrong_version_number", "wrong version number", "record layer failure"),
+        "the server does not use TLS on this port: check the port, or connect without TLS (http://)",
+    ),
+    (
+        (
+            "hostname mismatch",
+            "ip address mismatch",
+            "hostname verification",
+            "is not valid for",
+            "is not in peer certificate",
+        ),
+        "the certificate is for another name: connect by a name in the certificate, or add this name to the certificate",
+    ),
+    (
+        ("certificate has expired", "not yet valid"),
+        "the certificate is not valid now: renew it, and check the clocks of both machines",
+    ),
+    (
+        ("certificate_verify_failed", "certificate verify failed"),
+        f"no trusted authority has signed the certificate: pass the certificate of its authority with --ca, ca= or {CA}",
+    ),
+    (
+        ("certificate_required", "certificate required", "peer_did_not_return"),
+        f"the service requires a client certificate: pass --cert and --key, cert= and key=, or {CERT} and {KEY}",
+    ),
+    (
+        ("alert_unknown_ca", "alert unknown ca", "alert_bad_certificate", "alert bad certificate", "alert_certificate"),
+        "the service does not accept the client certificate: pass one that its authority (STREETFIX_TLS_CLIENT_CA) has signed",
+    ),
+    (
+        ("ssl_error_ssl", "tls handshake", "ssl handshake", "[ssl"),
+        "check the address, and the TLS settings of both sides",
+    ),
+)
 
 
 def closed_hint(*, speaks_tls: bool, shows_certificate: bool) -> str:

@@ -42,9 +42,21 @@ def finest_rad(grid: ViewGrid) -> float:
 @cache
 def _library() -> ctypes.CDLL:
     arguments: list[Any] = [
-        c_void_p, c_int64, c_void_p, c_void_p, POINTER(CPicture), c_void_p, c_void_p, POINTER(CPicture), c_double, c_double, c_int64,
-        c_void_p, c_void_p, c_void_p,
-    ]  # fmt: skip
+        c_void_p,
+        c_int64,
+        c_void_p,
+        c_void_p,
+        POINTER(CPicture),
+        c_void_p,
+        c_void_p,
+        POINTER(CPicture),
+        c_double,
+        c_double,
+        c_int64,
+        c_void_p,
+        c_void_p,
+        c_void_p,
+    ]
     library = load(LIBRARY, {"Picture": CPicture}, {"SAMPLES": SUB_RAYS**2, "ARGUMENTS": len(arguments)})
     library.streetfix_gather.argtypes = arguments
     library.streetfix_gather.restype = None

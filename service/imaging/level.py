@@ -211,9 +211,20 @@ def level_query(
 
 
 class _Ground(Structure):
-    _fields_ = [(name, c_double) for name in (
-        "near_m", "reach_m", "below_m", "height_m", "tilt_prior", "height_prior_m", "noise_m", "noise_per_m", "correlated",
-    )]  # fmt: skip
+    _fields_ = [
+        (name, c_double)
+        for name in (
+            "near_m",
+            "reach_m",
+            "below_m",
+            "height_m",
+            "tilt_prior",
+            "height_prior_m",
+            "noise_m",
+            "noise_per_m",
+            "correlated",
+        )
+    ]
 
 
 #: Ground point in the work buffer of the fit: position in the nominal level frame (m), horizontal distance (m), weight (1/m^2).

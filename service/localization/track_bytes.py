@@ -31,9 +31,15 @@ def packed(track: Track, *, map_version: str) -> bytes:
     """
     belief, last = track.belief, () if track.last is None else (track.last,)
     head = _HEAD.pack(
-        _FORMAT, _digest(map_version), min(track.epoch, _MOST_COUNT), min(belief.born, _MOST_COUNT), belief.elsewhere, belief.outside,
-        len(belief.modes), len(last),
-    )  # fmt: skip
+        _FORMAT,
+        _digest(map_version),
+        min(track.epoch, _MOST_COUNT),
+        min(belief.born, _MOST_COUNT),
+        belief.elsewhere,
+        belief.outside,
+        len(belief.modes),
+        len(last),
+    )
     return head + b"".join(_packed_mode(mode) for mode in (*belief.modes, *last))
 
 
@@ -57,9 +63,16 @@ def _digest(map_version: str) -> bytes:
 def _packed_mode(mode: Mode) -> bytes:
     T = mode.T_map_camera
     return _MODE.pack(
-        *T[:3, 3], *quaternion_xyzw_from(T[:3, :3]), *mode.covariance[_UPPER], mode.weight, mode.number, mode.inliers,
-        mode.similarity, mode.news, min(mode.unseen, _MOST_UNSEEN),
-    )  # fmt: skip
+        *T[:3, 3],
+        *quaternion_xyzw_from(T[:3, :3]),
+        *mode.covariance[_UPPER],
+        mode.weight,
+        mode.number,
+        mode.inliers,
+        mode.similarity,
+        mode.news,
+        min(mode.unseen, _MOST_UNSEEN),
+    )
 
 
 def _mode(content: bytes, at: int) -> Mode:

@@ -21,10 +21,26 @@ EXAMPLES = 25
 
 
 OPERATIONS = (
-    "localize", "localizeSequence", "localizeBatch", "postGeoPose", "getGeoPoseStatus", "listMaps", "serveVersion", "getStreets",
-    "getCoverage", "getCloud", "getPlaces", "explain", "listSamples", "getSample", "listAnswers",
-    "getLiveness", "getReadiness", "getMetrics", "getVersion",
-)  # fmt: skip
+    "localize",
+    "localizeSequence",
+    "localizeBatch",
+    "postGeoPose",
+    "getGeoPoseStatus",
+    "listMaps",
+    "serveVersion",
+    "getStreets",
+    "getCoverage",
+    "getCloud",
+    "getPlaces",
+    "explain",
+    "listSamples",
+    "getSample",
+    "listAnswers",
+    "getLiveness",
+    "getReadiness",
+    "getMetrics",
+    "getVersion",
+)
 
 
 @pytest.fixture(scope="module")

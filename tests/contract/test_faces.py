@@ -76,14 +76,35 @@ def numbered(parts: dict[str, bytes], count: int, document: dict[str, Any]) -> d
         ({"options": {"refine": False, "neighbours": 3}}, {"options": pb.Options(refine=False, neighbours=3)}),
         ({"gravity": {"x": 0.02, "y": 1, "z": 0}}, {"gravity": pb.Vector3(x=0.02, y=1)}),
         ({"T_vehicle_camera": AHEAD}, {"vehicle_from_camera": AHEAD}),
-        ({"T_vehicle_camera": AHEAD | {"position": {"x": 0, "y": 0, "z": 1.6}}, "vehicle_base_on_ground": True},
-         {"vehicle_from_camera": AHEAD | {"position": {"x": 0, "y": 0, "z": 1.6}}, "vehicle_base_on_ground": True}),
-        ({"camera": {"width": 64, "height": 48, "fx": 32, "fy": 32, "cx": 31.5, "cy": 23.5, "height_m": 1.52, "height_std_m": 0.02}},
-         {"camera": pb.Camera(width=64, height=48, fx=32, fy=32, cx=31.5, cy=23.5, height_m=1.52, height_std_m=0.02)}),
-        ({"map": "tiny", "prior": {"position": {"x": 20, "y": 2}, "heading_deg": 90}},
-         {"map": "tiny", "prior": pb.Prior(position=pb.PriorPosition(x=20, y=2), heading_deg=90)}),
+        (
+            {"T_vehicle_camera": AHEAD | {"position": {"x": 0, "y": 0, "z": 1.6}}, "vehicle_base_on_ground": True},
+            {"vehicle_from_camera": AHEAD | {"position": {"x": 0, "y": 0, "z": 1.6}}, "vehicle_base_on_ground": True},
+        ),
+        (
+            {
+                "camera": {
+                    "width": 64,
+                    "height": 48,
+                    "fx": 32,
+                    "fy": 32,
+                    "cx": 31.5,
+                    "cy": 23.5,
+                    "height_m": 1.52,
+                    "height_std_m": 0.02,
+                }
+            },
+            {
+                "camera": pb.Camera(
+                    width=64, height=48, fx=32, fy=32, cx=31.5, cy=23.5, height_m=1.52, height_std_m=0.02
+                )
+            },
+        ),
+        (
+            {"map": "tiny", "prior": {"position": {"x": 20, "y": 2}, "heading_deg": 90}},
+            {"map": "tiny", "prior": pb.Prior(position=pb.PriorPosition(x=20, y=2), heading_deg=90)},
+        ),
     ],
-)  # fmt: skip
+)
 def test_one_pair(faces: Any, parts_of: Parts, changed: dict[str, Any], message: dict[str, Any]) -> None:
     client, stub = faces
     parts = parts_of(**changed)

@@ -178,11 +178,19 @@ def answers_with(true_xy: Any, answer_xy: Any, **changed: Any) -> Any:
     ranked = np.full((count, RANKED, 2), np.nan)
     ranked[:, 0] = answer_xy
     given = {
-        "T_true": T_true, "T_answer": T_answer, "street_true": np.zeros(count, int), "street_answer": np.where(none, -1, 0),
-        "ranked_xy": ranked, "ranked_place": np.full((count, RANKED), -1), "status": np.where(none, "", "LOCALIZED"),
-        "confidence": np.full(count, np.nan), "evidence": np.full((count, len(FEATURES)), np.nan),
-        "covariance": np.full((count, 6, 6), np.nan), "ms": np.full(count, 20.0), "stamp_s": np.arange(float(count)),
-    }  # fmt: skip
+        "T_true": T_true,
+        "T_answer": T_answer,
+        "street_true": np.zeros(count, int),
+        "street_answer": np.where(none, -1, 0),
+        "ranked_xy": ranked,
+        "ranked_place": np.full((count, RANKED), -1),
+        "status": np.where(none, "", "LOCALIZED"),
+        "confidence": np.full(count, np.nan),
+        "evidence": np.full((count, len(FEATURES)), np.nan),
+        "covariance": np.full((count, 6, 6), np.nan),
+        "ms": np.full(count, 20.0),
+        "stamp_s": np.arange(float(count)),
+    }
     return Predictions(**given | {name: np.array(value) for name, value in changed.items()})
 
 

@@ -18,8 +18,18 @@ from service.registration import kernel, points, rays, visibility
 LIBRARIES = (gather.LIBRARY, level.LIBRARY, kernel.LIBRARY, points.LIBRARY, visibility.LIBRARY)
 
 
-@pytest.mark.parametrize("loaded", [gather._library, level._library, kernel._library, points._library, visibility._library,
-                                    rays._library, depth16.library])  # fmt: skip
+@pytest.mark.parametrize(
+    "loaded",
+    [
+        gather._library,
+        level._library,
+        kernel._library,
+        points._library,
+        visibility._library,
+        rays._library,
+        depth16.library,
+    ],
+)
 def test_the_compiled_layout_fits_the_python_declarations(loaded):
     assert loaded() is not None
 

@@ -9,9 +9,18 @@ from benchmarks.fuzz.targets import survives, targets
 
 INPUTS = 4000
 NAMES = (
-    "http", "multipart", "request_json", "sequence_json", "oscp_json", "grpc", "depth", "depth_png_rows", "colour", "bundle",
+    "http",
+    "multipart",
+    "request_json",
+    "sequence_json",
+    "oscp_json",
+    "grpc",
+    "depth",
+    "depth_png_rows",
+    "colour",
+    "bundle",
     "pictures",
-)  # fmt: skip
+)
 
 
 @pytest.fixture(scope="module")

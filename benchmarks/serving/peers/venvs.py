@@ -11,27 +11,57 @@ FOLDER = ROOT / "data" / "peers"
 #: Exact requirements of each peer: the framework and the packages that it serves with.
 REQUIREMENTS: dict[str, tuple[str, ...]] = {
     "litserve": (
-        "litserve==0.2.19", "fastapi==0.165.0", "httptools==0.9.0", "python-multipart==0.0.34", "starlette==1.10.0", "uvicorn==0.54.0",
+        "litserve==0.2.19",
+        "fastapi==0.165.0",
+        "httptools==0.9.0",
+        "python-multipart==0.0.34",
+        "starlette==1.10.0",
+        "uvicorn==0.54.0",
         "uvloop==0.23.0",
     ),
     "bentoml": (
-        "bentoml==1.4.39", "httptools==0.9.0", "python-multipart==0.0.34", "starlette==1.10.0", "uvicorn==0.54.0", "uvloop==0.23.0",
-    ),
-    "mlserver": (
-        "mlserver==1.7.1", "fastapi==0.115.14", "httptools==0.9.0", "orjson==3.13.0", "python-multipart==0.0.34", "starlette==0.46.2",
-        "uvicorn==0.54.0", "uvloop==0.23.0",
-    ),
-    "ray": (
-        "ray[serve]==2.60.0", "fastapi==0.165.0", "httptools==0.9.0", "python-multipart==0.0.34", "starlette==1.10.0", "uvicorn==0.54.0",
+        "bentoml==1.4.39",
+        "httptools==0.9.0",
+        "python-multipart==0.0.34",
+        "starlette==1.10.0",
+        "uvicorn==0.54.0",
         "uvloop==0.23.0",
     ),
-}  # fmt: skip
+    "mlserver": (
+        "mlserver==1.7.1",
+        "fastapi==0.115.14",
+        "httptools==0.9.0",
+        "orjson==3.13.0",
+        "python-multipart==0.0.34",
+        "starlette==0.46.2",
+        "uvicorn==0.54.0",
+        "uvloop==0.23.0",
+    ),
+    "ray": (
+        "ray[serve]==2.60.0",
+        "fastapi==0.165.0",
+        "httptools==0.9.0",
+        "python-multipart==0.0.34",
+        "starlette==1.10.0",
+        "uvicorn==0.54.0",
+        "uvloop==0.23.0",
+    ),
+}
 #: Packages that the pipeline and the contract import. Equal versions keep the comparison fair. Streetfix's gRPC side is
 #: left out: it needs a newer protobuf than MLServer.
 PIPELINE = (
-    "deflate", "faiss-cpu", "jaxtyping", "lz4", "numpy", "onnxruntime", "opencv-python-headless", "prometheus-client", "pydantic",
-    "pydantic-settings", "zstandard",
-)  # fmt: skip
+    "deflate",
+    "faiss-cpu",
+    "jaxtyping",
+    "lz4",
+    "numpy",
+    "onnxruntime",
+    "opencv-python-headless",
+    "prometheus-client",
+    "pydantic",
+    "pydantic-settings",
+    "zstandard",
+)
 
 
 class PeerError(Exception):

@@ -18,12 +18,19 @@ RUN = {
 def test_conditions_stand_beside_the_clear_day_with_the_stage_that_loses_most():
     head = "full.condition."
     values: dict[str, float | None] = {
-        f"{head}clear.within_1_m": 0.98, f"{head}clear.recall_at_10_5m": 1.0,
-        f"{head}night.within_1_m": 0.90, f"{head}night.recall_at_10_5m": 0.99, f"{head}night.forced_within_1_m": 0.92,
-        f"{head}fog.within_1_m": 0.80, f"{head}fog.recall_at_10_5m": 0.85, f"{head}fog.forced_within_1_m": 0.82,
-        f"{head}night.recall_at_1_5m": 0.95, "raw.condition.night.recall_at_1_5m": 0.5,
-        f"{head}five.within_1_m": 0.99, "full.unseen.precise.within_1_m": 0.5,
-    }  # fmt: skip
+        f"{head}clear.within_1_m": 0.98,
+        f"{head}clear.recall_at_10_5m": 1.0,
+        f"{head}night.within_1_m": 0.90,
+        f"{head}night.recall_at_10_5m": 0.99,
+        f"{head}night.forced_within_1_m": 0.92,
+        f"{head}fog.within_1_m": 0.80,
+        f"{head}fog.recall_at_10_5m": 0.85,
+        f"{head}fog.forced_within_1_m": 0.82,
+        f"{head}night.recall_at_1_5m": 0.95,
+        "raw.condition.night.recall_at_1_5m": 0.5,
+        f"{head}five.within_1_m": 0.99,
+        "full.unseen.precise.within_1_m": 0.5,
+    }
     lines = render._conditions(values)
     assert lines[3:] == [
         "| night | 0.900 | 0.980 | -0.080 | choice and registration (7.0 points) | 0.950 | 0.500 |",

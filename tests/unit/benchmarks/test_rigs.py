@@ -18,10 +18,15 @@ def family(name, seed, *, count=1000):
     evidence[:, SHARE] = 0.0
     error = np.where(known[:, None], 0.1 * rng.normal(size=(count, 6)), np.nan)
     return Asked(
-        evidence=evidence, right=known, known=known, kind=np.where(known, "clear", "other_city"),
-        family=np.full(count, name), error=error, covariance=np.tile(0.01 * np.eye(6), (count, 1, 1)),
+        evidence=evidence,
+        right=known,
+        known=known,
+        kind=np.where(known, "clear", "other_city"),
+        family=np.full(count, name),
+        error=error,
+        covariance=np.tile(0.01 * np.eye(6), (count, 1, 1)),
         heading_rad=np.where(known, 0.5, np.nan),
-    )  # fmt: skip
+    )
 
 
 @pytest.fixture

@@ -70,12 +70,20 @@ def answer_of(refused_of: Callable[..., dict[str, Any]]) -> Callable[..., Locali
             "covariance": np.diag([0.01, 0.02, 0.03, 0.001, 0.002, 0.003]).reshape(-1).tolist(),
         }
         content = {
-            "status": "LOCALIZED", "confidence": 0.95, "camera_height": {"height_m": 0.31, "origin": "given"},
+            "status": "LOCALIZED",
+            "confidence": 0.95,
+            "camera_height": {"height_m": 0.31, "origin": "given"},
             "street": {"id": "s2", "name": "End", "street": "4", "section": "end", "class_index": 6, "vote": 0.5},
-            "pose": pose, "vehicle_pose": None, "geopose": None, "hypotheses": [], "spread": None, "reasons": [], "neighbours": [],
+            "pose": pose,
+            "vehicle_pose": None,
+            "geopose": None,
+            "hypotheses": [],
+            "spread": None,
+            "reasons": [],
+            "neighbours": [],
             "map": {"name": "tiny", "version": "abc"},
             "timings_ms": {"decode": 1, "fuse": 1, "encode": 1, "search": 1, "register": 1, "total": 5},
-        }  # fmt: skip
+        }
         if changed.get("status", "LOCALIZED") != "LOCALIZED":
             return LocalizeAnswer.model_validate(refused_of(content, **changed))
         return LocalizeAnswer.model_validate(content | changed)

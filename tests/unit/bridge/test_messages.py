@@ -21,12 +21,21 @@ MADE: list[Any] = [
     messages.Image(HEADER, 2, 3, "rgb8", 1, 9, bytes(range(18))),
     messages.Image(),
     messages.CameraInfo(
-        HEADER, 4, 6, "plumb_bob", [0.1, 0.2], list(range(9)), list(range(9)), list(range(12)), 1, 2,
+        HEADER,
+        4,
+        6,
+        "plumb_bob",
+        [0.1, 0.2],
+        list(range(9)),
+        list(range(9)),
+        list(range(12)),
+        1,
+        2,
         messages.RegionOfInterest(1, 2, 3, 4, True),
     ),
     pose_message(POSE),
     diagnostics_message(TOLD),
-]  # fmt: skip
+]
 
 
 def ros_name(message: Any) -> str:

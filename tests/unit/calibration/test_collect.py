@@ -22,10 +22,19 @@ def predictions(errors_m, *, up_m=0.0):
     T_answer[:, 0, 3], T_answer[:, 2, 3] = 0.6 * np.array(errors_m), up_m
     T_answer[:, 1, 3] = 0.8 * np.array(errors_m)
     return Predictions(
-        T_true, T_answer, np.zeros(count, int), np.zeros(count, int), np.zeros((count, RANKED, 2)), np.zeros((count, RANKED), int),
-        np.full(count, "LOCALIZED"), np.full(count, 0.5), np.arange(count * len(FEATURES), dtype=float).reshape(count, -1),
-        np.zeros((count, 6, 6)), np.zeros(count), np.zeros(count),
-    )  # fmt: skip
+        T_true,
+        T_answer,
+        np.zeros(count, int),
+        np.zeros(count, int),
+        np.zeros((count, RANKED, 2)),
+        np.zeros((count, RANKED), int),
+        np.full(count, "LOCALIZED"),
+        np.full(count, 0.5),
+        np.arange(count * len(FEATURES), dtype=float).reshape(count, -1),
+        np.zeros((count, 6, 6)),
+        np.zeros(count),
+        np.zeros(count),
+    )
 
 
 def test_an_answer_within_a_metre_on_the_ground_is_right():
@@ -147,8 +156,11 @@ def test_walls_and_rooms_are_nowhere_and_told_by_kind_and_preset():
     camera = PinholeCamera(32, 24, 16.0, 16.0, 15.5, 11.5)
     found = walls_and_rooms(localizer, camera, 3, lambda *told_of: told.append(told_of), MODELS, count=4)
     assert [set(each.kind.tolist()) for each in found] == [
-        {"wall.precise"}, {"wall.stereo"}, {"room.precise"}, {"room.stereo"},
-    ]  # fmt: skip
+        {"wall.precise"},
+        {"wall.stereo"},
+        {"room.precise"},
+        {"room.stereo"},
+    ]
     assert not any(each.known.any() or each.right.any() for each in found)
     for part, each in enumerate(found):
         rows = each.evidence[:, 0]
@@ -163,8 +175,11 @@ def test_another_rig_sees_the_same_walls_and_rooms():
     walls_and_rooms(whole, camera, 3, lambda *_: None, MODELS, count=2)
     found = walls_and_rooms(cut, camera, 3, lambda *_: None, MODELS, count=2, rig=RIGS[0])
     assert [set(each.kind.tolist()) for each in found] == [
-        {"narrow_wall.precise"}, {"narrow_wall.stereo"}, {"narrow_room.precise"}, {"narrow_room.stereo"},
-    ]  # fmt: skip
+        {"narrow_wall.precise"},
+        {"narrow_wall.stereo"},
+        {"narrow_room.precise"},
+        {"narrow_room.stereo"},
+    ]
     for query, seen in zip(whole.asked, cut.asked, strict=True):
         np.testing.assert_array_equal(seen.depth_m, RIGS[0].seen(query).depth_m)
 

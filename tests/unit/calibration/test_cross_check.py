@@ -17,10 +17,15 @@ def family(name, seed, *, upside_down=False, count=2000):
     evidence[:, MARGIN] += np.where(right, 3.0, -3.0) * (-1 if upside_down else 1)
     evidence[:, SHARE] = 0.0
     return Asked(
-        evidence=evidence, right=right, known=known, kind=np.where(known, "clear", "other_city"),
-        family=np.full(count, name), error=np.full((count, 6), np.nan), covariance=np.full((count, 6, 6), np.nan),
+        evidence=evidence,
+        right=right,
+        known=known,
+        kind=np.where(known, "clear", "other_city"),
+        family=np.full(count, name),
+        error=np.full((count, 6), np.nan),
+        covariance=np.full((count, 6, 6), np.nan),
         heading_rad=np.full(count, np.nan),
-    )  # fmt: skip
+    )
 
 
 @pytest.fixture(scope="module")

@@ -36,10 +36,15 @@ def asked_of(evidence, right, known, kind=None, family="any"):
     kind = np.where(known, "clear", "other_city") if kind is None else np.array(kind)
     count = len(evidence)
     return Asked(
-        evidence=evidence, right=np.array(right, bool), known=np.array(known, bool), kind=kind,
-        family=np.broadcast_to(np.array(family), (count,)), error=np.full((count, 6), np.nan),
-        covariance=np.full((count, 6, 6), np.nan), heading_rad=np.full(count, np.nan),
-    )  # fmt: skip
+        evidence=evidence,
+        right=np.array(right, bool),
+        known=np.array(known, bool),
+        kind=kind,
+        family=np.broadcast_to(np.array(family), (count,)),
+        error=np.full((count, 6), np.nan),
+        covariance=np.full((count, 6, 6), np.nan),
+        heading_rad=np.full(count, np.nan),
+    )
 
 
 @pytest.fixture(scope="module")
@@ -322,8 +327,13 @@ def test_the_calibration_error_lies_between_that_of_all_as_one_and_that_of_each_
 
 @pytest.mark.parametrize(
     ("right", "known"),
-    [([1, 1, 1, 1], [1, 1, 0, 0]), ([0, 0, 0, 0], [1, 1, 0, 0]), ([1, 0, 1, 0], [1, 1, 1, 1]), ([1, 0, 0, 0], [0, 0, 0, 0])],
-)  # fmt: skip
+    [
+        ([1, 1, 1, 1], [1, 1, 0, 0]),
+        ([0, 0, 0, 0], [1, 1, 0, 0]),
+        ([1, 0, 1, 0], [1, 1, 1, 1]),
+        ([1, 0, 0, 0], [0, 0, 0, 0]),
+    ],
+)
 def test_queries_of_one_sort_alone_are_refused(right, known):
     asked = asked_of(evidence_of(np.random.default_rng(0), 4), right, known)
     with pytest.raises(DatasetError, match="needs right and wrong answers, and queries in the map and outside it"):

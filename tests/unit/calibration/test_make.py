@@ -27,10 +27,15 @@ def city(seed, *, upside_down=False, count=1200):
     presets = np.where(rng.random(count) < 0.5, "precise", "stereo")
     names = np.array(["clear_", "other_city.", "removed_streets.", "wall.", "room."])[sort]
     return Asked(
-        evidence=evidence, right=right, known=known, kind=np.char.add(names, presets), family=np.full(len(evidence), "any"),
-        error=np.full((len(evidence), 6), np.nan), covariance=np.full((len(evidence), 6, 6), np.nan),
+        evidence=evidence,
+        right=right,
+        known=known,
+        kind=np.char.add(names, presets),
+        family=np.full(len(evidence), "any"),
+        error=np.full((len(evidence), 6), np.nan),
+        covariance=np.full((len(evidence), 6, 6), np.nan),
         heading_rad=np.full(len(evidence), np.nan),
-    )  # fmt: skip
+    )
 
 
 def _dataset(name, folder):

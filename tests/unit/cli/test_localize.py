@@ -23,22 +23,46 @@ ANSWER: dict[str, Any] = {
     "vehicle_pose": None,
     "geopose": None,
     "hypotheses": [
-        {"confirmed": True,
-         "pose": {"position": {"x": 1.234, "y": 5, "z": 1.5}, "orientation": {}, "heading_deg": 90.4, "covariance": None},
-         "share": 0.625, "inliers": 0.5, "similarity": 0.9},
-        {"confirmed": False,
-         "pose": {"position": {"x": 77, "y": -88, "z": 1.5}, "orientation": {}, "heading_deg": -89.6, "covariance": None},
-         "share": 0.375, "inliers": 0.25, "similarity": 0.875},
+        {
+            "confirmed": True,
+            "pose": {
+                "position": {"x": 1.234, "y": 5, "z": 1.5},
+                "orientation": {},
+                "heading_deg": 90.4,
+                "covariance": None,
+            },
+            "share": 0.625,
+            "inliers": 0.5,
+            "similarity": 0.9,
+        },
+        {
+            "confirmed": False,
+            "pose": {
+                "position": {"x": 77, "y": -88, "z": 1.5},
+                "orientation": {},
+                "heading_deg": -89.6,
+                "covariance": None,
+            },
+            "share": 0.375,
+            "inliers": 0.25,
+            "similarity": 0.875,
+        },
     ],
     "spread": None,
     "reasons": [],
     "neighbours": [
-        {"place": 8, "distance": 0.1, "similarity": 0.995, "street": None, "position": {"x": 1, "y": 2, "z": 3},
-         "heading_deg": 90.0},
+        {
+            "place": 8,
+            "distance": 0.1,
+            "similarity": 0.995,
+            "street": None,
+            "position": {"x": 1, "y": 2, "z": 3},
+            "heading_deg": 90.0,
+        },
     ],
     "map": {"name": "tiny", "version": "0123456789abcdef"},
     "timings_ms": {"decode": 1.0, "total": 2.0},
-}  # fmt: skip
+}
 
 
 #: What a refused answer has in their place.

@@ -152,17 +152,33 @@ def test_simulate_says_what_is_wrong_and_writes_nothing(
 
 OUT_OF_BOUNDS = {
     "simulate": [
-        ("--seed", "-1"), ("--spacing", "0"), ("--queries", "-1"), ("--drives", "0"), ("--on-track", "-1"), ("--parked-changed", "2"),
-        ("--aside", "-1"), ("--heading", "181"), ("--turn", "200"), ("--pitch", "90"), ("--blocked", "1"), ("--max-depth", "0"),
-        ("--hfov", "5"), ("--workers", "-1"),
+        ("--seed", "-1"),
+        ("--spacing", "0"),
+        ("--queries", "-1"),
+        ("--drives", "0"),
+        ("--on-track", "-1"),
+        ("--parked-changed", "2"),
+        ("--aside", "-1"),
+        ("--heading", "181"),
+        ("--turn", "200"),
+        ("--pitch", "90"),
+        ("--blocked", "1"),
+        ("--max-depth", "0"),
+        ("--hfov", "5"),
+        ("--workers", "-1"),
     ],
     "build-map": [("--spacing", "-1"), ("--headings", "0"), ("--voxel", "0"), ("--lidar-height", "0")],
     "evaluate": [("--workers", "0")],
     "train": [
-        ("--cities", "0"), ("--steps", "0"), ("--pairs", "1"), ("--rate", "0"), ("--seed", "-1"), ("--workers", "0"),
+        ("--cities", "0"),
+        ("--steps", "0"),
+        ("--pairs", "1"),
+        ("--rate", "0"),
+        ("--seed", "-1"),
+        ("--workers", "0"),
     ],
     "demo": [("--queries", "0"), ("--seed", "-1"), ("--port", "70000")],
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize(

@@ -202,12 +202,22 @@ def test_an_answer_that_is_not_localized_has_no_pose_to_use(
     assert [each.confirmed for each in answer.hypotheses] == [False, False]
 
 
-@pytest.mark.parametrize("lie", [
-    {"status": "OUT_OF_MAP"},  # a pose all the same, as before
-    {"pose": None},
-    {"spread": {"mean": {"x": 0, "y": 0, "z": 0}, "covariance": [0.0] * 9, "heading_std_deg": 0, "hypotheses_weight": 1}},
-    {"reasons": [{"check": "baseline", "evidence": {"log_noise": 4.0}, "remedy": "check it"}]},
-])  # fmt: skip
+@pytest.mark.parametrize(
+    "lie",
+    [
+        {"status": "OUT_OF_MAP"},  # a pose all the same, as before
+        {"pose": None},
+        {
+            "spread": {
+                "mean": {"x": 0, "y": 0, "z": 0},
+                "covariance": [0.0] * 9,
+                "heading_std_deg": 0,
+                "hypotheses_weight": 1,
+            }
+        },
+        {"reasons": [{"check": "baseline", "evidence": {"log_noise": 4.0}, "remedy": "check it"}]},
+    ],
+)
 def test_an_answer_whose_status_and_pose_contradict_each_other_is_none(
     ask: Asking, answer_json: Json, lie: dict[str, Any]
 ) -> None:
@@ -272,9 +282,18 @@ def test_a_batch_has_answers_and_refusals_in_their_places(ask: Asking, answer_js
 
 def test_maps_streets_and_coverage_are_read(ask: Asking) -> None:
     entry = {
-        "name": "a/b", "version": "v", "made_at": "2026", "places": 1, "views": 2, "streets": 3, "spacing_m": 1.0,
-        "encoder_sha256": "e", "georeferenced": False, "licence": "L", "versions": ["v"],
-    }  # fmt: skip
+        "name": "a/b",
+        "version": "v",
+        "made_at": "2026",
+        "places": 1,
+        "views": 2,
+        "streets": 3,
+        "spacing_m": 1.0,
+        "encoder_sha256": "e",
+        "georeferenced": False,
+        "licence": "L",
+        "versions": ["v"],
+    }
     collection = {"type": "FeatureCollection", "features": []}
     answers = {"/v1/maps": {"maps": [entry]}, "/v1/maps/a%2Fb/streets": collection, "/v1/coverage": collection}
 
@@ -425,10 +444,17 @@ def test_a_time_that_is_none_is_refused(timeout_s: float) -> None:
 @pytest.mark.parametrize(
     ("header", "seconds"),
     [
-        (None, None), ("2", 2.0), (" 5 ", 5.0), ("Sun, 22 Nov 2026 00:00:30 GMT", 30.0), ("Sat, 21 Nov 2026 00:00:00 GMT", 0.0),
-        ("Sun, 22 Nov 2026 00:00:30 -0000", 30.0), ("soon", None), ("-1", None), ("1.5", None),
+        (None, None),
+        ("2", 2.0),
+        (" 5 ", 5.0),
+        ("Sun, 22 Nov 2026 00:00:30 GMT", 30.0),
+        ("Sat, 21 Nov 2026 00:00:00 GMT", 0.0),
+        ("Sun, 22 Nov 2026 00:00:30 -0000", 30.0),
+        ("soon", None),
+        ("-1", None),
+        ("1.5", None),
     ],
-)  # fmt: skip
+)
 def test_retry_after_is_a_number_or_a_date(header: str | None, seconds: float | None) -> None:
     assert rest.retry_after_s(header, now=datetime(2026, 11, 22, tzinfo=UTC)) == seconds
 

@@ -225,9 +225,15 @@ def test_maps_streets_and_coverage(client: GrpcClient, told: Told) -> None:
 
 @pytest.mark.parametrize(
     "error",
-    [ImageSizeError("w", field="rgb"), TooLargeError("w"), UnknownMapError("w"), UnauthorizedError("w"), DeadlineError("w")],
+    [
+        ImageSizeError("w", field="rgb"),
+        TooLargeError("w"),
+        UnknownMapError("w"),
+        UnauthorizedError("w"),
+        DeadlineError("w"),
+    ],
     ids=lambda error: error.code,
-)  # fmt: skip
+)
 def test_a_problem_is_reported_after_one_request(client: GrpcClient, told: Told, error: StreetfixError) -> None:
     told.answers = [error]
     with pytest.raises(RefusedError) as caught:

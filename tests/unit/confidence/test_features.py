@@ -57,10 +57,18 @@ def weighed(candidate, frame):
 
 @pytest.mark.parametrize(
     ("name", "expected"),
-    [("inliers", 0.7), ("similarity", 0.8), ("likelihood", -1.5), ("through", 0.02 / 0.9), ("front", 0.2 / 0.9), ("unmapped", 0.1),
-     ("mapped_inliers", 0.7 / 0.9),
-     ("measured", 0.75), ("place_m", 1.5)],
-)  # fmt: skip
+    [
+        ("inliers", 0.7),
+        ("similarity", 0.8),
+        ("likelihood", -1.5),
+        ("through", 0.02 / 0.9),
+        ("front", 0.2 / 0.9),
+        ("unmapped", 0.1),
+        ("mapped_inliers", 0.7 / 0.9),
+        ("measured", 0.75),
+        ("place_m", 1.5),
+    ],
+)
 def test_features_of_the_best_candidate_are_unchanged(candidate, weighed, name, expected):
     worse = {"similarity": 0.1, "place_m": 7.0, "likelihood": -9.0, "through": 0.9, "front": 0.9, "unmapped": 0.9}
     other = replace(candidate(-1.0, xyz=(50, 0, 1.5)), scores=worse)

@@ -24,11 +24,20 @@ SERVICE = Path(__file__).parents[3] / "service"
 Json = dict[str, Any]
 T = {"position": {"x": 1, "y": 2, "z": 3}, "orientation": {"x": 0.1, "y": 0.2, "z": 0.3, "w": 0.9}}
 FRAME: Json = {
-    "camera": {"model": "PINHOLE", "width": 64, "height": 48, "fx": 32, "fy": 32, "cx": 31.5, "cy": 23.5,
-               "distortion": [-0.1, 0.02, 0, 0], "distortion_model": "brown_conrady"},
+    "camera": {
+        "model": "PINHOLE",
+        "width": 64,
+        "height": 48,
+        "fx": 32,
+        "fy": 32,
+        "cx": 31.5,
+        "cy": 23.5,
+        "distortion": [-0.1, 0.02, 0, 0],
+        "distortion_model": "brown_conrady",
+    },
     "depth": {"scale_m": 0.001, "kind": "z", "encoding": "auto", "max_range_m": 40, "baseline_m": 0.12},
     "gravity": {"x": 0.1, "y": 1, "z": 0.1},
-}  # fmt: skip
+}
 ABOUT: Json = {
     "map": "tiny",
     "T_vehicle_camera": T,

@@ -75,12 +75,31 @@ def change_json(path, change):
 DEFECTS = {
     "description missing": ("dataset.json", lambda p: p.unlink(), "dataset.json is missing"),
     "description is no JSON": ("dataset.json", lambda p: p.write_text("{"), "dataset.json"),
-    "description lacks the name": ("dataset.json", lambda p: change_json(p, lambda d: d.pop("name")), "dataset.json: name"),
-    "description knows more": ("dataset.json", lambda p: change_json(p, lambda d: d.update(extra=1)), "dataset.json: extra"),
-    "format of another time": ("dataset.json", lambda p: change_json(p, lambda d: d.update(format=9)), "format 9 is not 1"),
-    "camera underground": ("dataset.json", lambda p: change_json(p, lambda d: d["sensors"]["cameras"][0].update(height_m=0.0)), "height_m"),
-    "deviation alone": ("dataset.json", lambda p: change_json(p, lambda d: d["sensors"]["cameras"][0].update(height_std_m=0.1)),
-                        "has height_std_m, but no height_m"),
+    "description lacks the name": (
+        "dataset.json",
+        lambda p: change_json(p, lambda d: d.pop("name")),
+        "dataset.json: name",
+    ),
+    "description knows more": (
+        "dataset.json",
+        lambda p: change_json(p, lambda d: d.update(extra=1)),
+        "dataset.json: extra",
+    ),
+    "format of another time": (
+        "dataset.json",
+        lambda p: change_json(p, lambda d: d.update(format=9)),
+        "format 9 is not 1",
+    ),
+    "camera underground": (
+        "dataset.json",
+        lambda p: change_json(p, lambda d: d["sensors"]["cameras"][0].update(height_m=0.0)),
+        "height_m",
+    ),
+    "deviation alone": (
+        "dataset.json",
+        lambda p: change_json(p, lambda d: d["sensors"]["cameras"][0].update(height_std_m=0.1)),
+        "has height_std_m, but no height_m",
+    ),
     "no camera": ("dataset.json", lambda p: change_json(p, lambda d: d["sensors"].update(cameras=[])), "has no camera"),
     "scan truncated": ("survey/scans/000001.bin", lambda p: p.write_bytes(p.read_bytes()[:-3]), "000001.bin: 77 bytes"),
     "scan empty": ("survey/scans/000000.bin", lambda p: p.write_bytes(b""), "000000.bin: 0 bytes"),
@@ -90,13 +109,29 @@ DEFECTS = {
     "pose with a word": ("survey/poses.txt", lambda p: replace_line(p, 0, "0 1 2 x 0 0 0 1"), "poses.txt, line 1"),
     "pose too short": ("survey/poses.txt", lambda p: replace_line(p, 1, "1 1 2 3 0 0 1"), "poses.txt, line 2"),
     "pose without rotation": ("survey/poses.txt", lambda p: replace_line(p, 1, "1 1 2 3 0 0 0 0"), "poses.txt, line 2"),
-    "truth too short": ("queries/drive/poses.txt", lambda p: p.write_text(POSE + "\n"), "has 1 lines, none for 000001.jpg"),
-    "truth with infinity": ("queries/drive/poses.txt", lambda p: replace_line(p, 0, "0 inf 2 3 0 0 0 1"), "poses.txt, line 1"),
+    "truth too short": (
+        "queries/drive/poses.txt",
+        lambda p: p.write_text(POSE + "\n"),
+        "has 1 lines, none for 000001.jpg",
+    ),
+    "truth with infinity": (
+        "queries/drive/poses.txt",
+        lambda p: replace_line(p, 0, "0 inf 2 3 0 0 0 1"),
+        "poses.txt, line 1",
+    ),
     "depth missing": ("queries/drive/depth/000001.png", lambda p: p.unlink(), "drive/depth has no image 000001"),
     "streets are no JSON": ("streets.geojson", lambda p: p.write_text("{"), "streets.geojson: not valid JSON"),
-    "cameras too few": ("queries/drive/cameras.txt", lambda p: p.write_text("front\n"), "cameras.txt has 1 lines for 2"),
-    "camera unknown": ("queries/drive/cameras.txt", lambda p: p.write_text("front\nback\n"), "cameras.txt names 'back'"),
-}  # fmt: skip
+    "cameras too few": (
+        "queries/drive/cameras.txt",
+        lambda p: p.write_text("front\n"),
+        "cameras.txt has 1 lines for 2",
+    ),
+    "camera unknown": (
+        "queries/drive/cameras.txt",
+        lambda p: p.write_text("front\nback\n"),
+        "cameras.txt names 'back'",
+    ),
+}
 
 
 @pytest.mark.parametrize(("file", "damage", "message"), DEFECTS.values(), ids=DEFECTS)

@@ -82,17 +82,31 @@ def ground(**changed):
 @pytest.mark.parametrize(
     ("changed", "text", "remedy"),
     [
-        ({"share": 0.05}, "no ground is visible: 5% of the pixels", "let the image show the ground, and send camera.height_m"),
-        ({"share": 0.05, "origin": "given", "given_m": 0.4}, "no ground is visible", "level camera 0.4 m above the ground"),
-        ({"height_m": 0.5, "found_by_service_m": 1.5, "origin": "assumed"},
-         "but the service does not accept this plane as ground and assumes 1.50 m",
-         "send camera.height_m and gravity"),
-        ({"height_m": 0.1, "found_by_service_m": 0.15}, "0.10 m above the ground", "send camera.height_m; if the camera is not mounted so"),
+        (
+            {"share": 0.05},
+            "no ground is visible: 5% of the pixels",
+            "let the image show the ground, and send camera.height_m",
+        ),
+        (
+            {"share": 0.05, "origin": "given", "given_m": 0.4},
+            "no ground is visible",
+            "level camera 0.4 m above the ground",
+        ),
+        (
+            {"height_m": 0.5, "found_by_service_m": 1.5, "origin": "assumed"},
+            "but the service does not accept this plane as ground and assumes 1.50 m",
+            "send camera.height_m and gravity",
+        ),
+        (
+            {"height_m": 0.1, "found_by_service_m": 0.15},
+            "0.10 m above the ground",
+            "send camera.height_m; if the camera is not mounted so",
+        ),
         ({"height_m": 4.5}, "4.50 m above the ground", "depth.scale_m or fy is wrong"),
         ({"pitch_deg": -16.0}, "16 degrees up", "send gravity"),
         ({"roll_deg": 20.0}, "rolled by 20 degrees", "send gravity"),
     ],
-)  # fmt: skip
+)
 def test_unusual_values_are_a_warning(changed, text, remedy):
     found = check_ground(ground(**changed))
     assert found.level == "warning"

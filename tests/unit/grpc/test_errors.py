@@ -72,18 +72,38 @@ def details(error: Any) -> dict[str, Any]:
     ("changed", "code", "reason", "field"),
     [
         ({"camera": None}, grpc.StatusCode.INVALID_ARGUMENT, "request", "camera"),
-        ({"camera": pb.Camera(width=64, height=48, fx=0, fy=32)}, grpc.StatusCode.INVALID_ARGUMENT, "request", "camera.fx"),
+        (
+            {"camera": pb.Camera(width=64, height=48, fx=0, fy=32)},
+            grpc.StatusCode.INVALID_ARGUMENT,
+            "request",
+            "camera.fx",
+        ),
         ({"camera": UNKNOWN_MODEL}, grpc.StatusCode.INVALID_ARGUMENT, "request", "camera.model"),
         ({"depth_format": UNKNOWN_KIND}, grpc.StatusCode.INVALID_ARGUMENT, "request", "depth.kind"),
-        ({"depth_format": pb.DepthFormat(scale_m=float("nan"))}, grpc.StatusCode.INVALID_ARGUMENT, "request", "depth.scale_m"),
+        (
+            {"depth_format": pb.DepthFormat(scale_m=float("nan"))},
+            grpc.StatusCode.INVALID_ARGUMENT,
+            "request",
+            "depth.scale_m",
+        ),
         ({"options": pb.Options(neighbours=51)}, grpc.StatusCode.INVALID_ARGUMENT, "request", "options.neighbours"),
-        ({"vehicle_from_camera": pb.RigidTransform()}, grpc.StatusCode.INVALID_ARGUMENT, "request", "T_vehicle_camera.orientation"),
+        (
+            {"vehicle_from_camera": pb.RigidTransform()},
+            grpc.StatusCode.INVALID_ARGUMENT,
+            "request",
+            "T_vehicle_camera.orientation",
+        ),
         ({"rgb": b"GIF89a" + bytes(50)}, grpc.StatusCode.INVALID_ARGUMENT, "format", "rgb"),
         ({"depth": b""}, grpc.StatusCode.INVALID_ARGUMENT, "undecodable", "depth"),
         ({"map": "../west"}, grpc.StatusCode.NOT_FOUND, "unknown-map", None),
-        ({"prior": pb.Prior(wgs84=pb.PriorWgs84(latitude_deg=1))}, grpc.StatusCode.INVALID_ARGUMENT, "request", "prior.wgs84"),
+        (
+            {"prior": pb.Prior(wgs84=pb.PriorWgs84(latitude_deg=1))},
+            grpc.StatusCode.INVALID_ARGUMENT,
+            "request",
+            "prior.wgs84",
+        ),
     ],
-)  # fmt: skip
+)
 def test_an_invalid_request_has_error_details(
     stub: LocalizationServiceStub, request_of: Any, changed: dict[str, Any], code: Any, reason: str, field: str | None
 ) -> None:

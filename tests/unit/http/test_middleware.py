@@ -70,17 +70,39 @@ def test_a_page_whose_name_was_made_to_point_here_changes_nothing(client_with: A
 
 @pytest.mark.parametrize(
     "host",
-    ["127.0.0.1", "127.0.0.1:8000", "localhost", "LOCALHOST:8000", "localhost.", "a.localhost", "[::1]:8000", "[::1]", "192.0.2.7:8000"],
-)  # fmt: skip
+    [
+        "127.0.0.1",
+        "127.0.0.1:8000",
+        "localhost",
+        "LOCALHOST:8000",
+        "localhost.",
+        "a.localhost",
+        "[::1]:8000",
+        "[::1]",
+        "192.0.2.7:8000",
+    ],
+)
 def test_addresses_and_loopback_names_are_always_ours(engine: Engine, app_client: AppClient, host: str) -> None:
     assert app_client(create_app(engine)).get("/v1/maps", headers={"Host": host}).status_code == 200
 
 
 @pytest.mark.parametrize(
     "host",
-    ["", "evil.example", "127.0.0.1.evil.example", "localhost.evil.example", "evil.example:127.0.0.1", "[::1].evil.example",
-     "127.0.0.1@evil.example", "evil.example/127.0.0.1", "notlocalhost", "::1", "[evil.example]", "localhost:8000:8000"],
-)  # fmt: skip
+    [
+        "",
+        "evil.example",
+        "127.0.0.1.evil.example",
+        "localhost.evil.example",
+        "evil.example:127.0.0.1",
+        "[::1].evil.example",
+        "127.0.0.1@evil.example",
+        "evil.example/127.0.0.1",
+        "notlocalhost",
+        "::1",
+        "[evil.example]",
+        "localhost:8000:8000",
+    ],
+)
 def test_a_name_that_looks_like_loopback_is_refused(engine: Engine, app_client: AppClient, host: str) -> None:
     assert app_client(create_app(engine)).get("/v1/maps", headers={"Host": host}).status_code == 403
 

@@ -178,9 +178,16 @@ def test_without_ground_the_usual_height_is_assumed():
 
 @pytest.mark.parametrize(
     ("height_m", "origin", "expected"),
-    [(3.0, "estimated", True), (0.75, "estimated", True), (3.0, "given", False), (1.5, "estimated", False),
-     (2.2, "estimated", False), (0.3, "estimated", False), (3.0, "assumed", False)],
-)  # fmt: skip
+    [
+        (3.0, "estimated", True),
+        (0.75, "estimated", True),
+        (3.0, "given", False),
+        (1.5, "estimated", False),
+        (2.2, "estimated", False),
+        (0.3, "estimated", False),
+        (3.0, "assumed", False),
+    ],
+)
 def test_half_and_twice_the_usual_height_are_suspicious_unless_given(height_m, origin, expected):
     assert is_suspicious_height(height_m, origin) == expected
 

@@ -13,8 +13,14 @@ def image(pixels, encoding, *, padding=0, big=False, **changed):
     pixels = np.ascontiguousarray(pixels.astype(pixels.dtype.newbyteorder(">" if big else "<")))
     rows = pixels.view(np.uint8).reshape(len(pixels), -1)
     data = np.pad(rows, ((0, 0), (0, padding)), constant_values=77)
-    told = {"height": pixels.shape[0], "width": pixels.shape[1], "encoding": encoding, "is_bigendian": int(big), "step": data.shape[1],
-            "data": data.reshape(-1)}  # fmt: skip
+    told = {
+        "height": pixels.shape[0],
+        "width": pixels.shape[1],
+        "encoding": encoding,
+        "is_bigendian": int(big),
+        "step": data.shape[1],
+        "data": data.reshape(-1),
+    }
     return Message(**(told | changed))
 
 

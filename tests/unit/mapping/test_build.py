@@ -23,9 +23,15 @@ SETTINGS = BuildSettings(
 
 @pytest.mark.parametrize(
     ("field", "value", "least"),
-    [("spacing_m", -1.0, "0"), ("between_m", -1.0, "0"), ("headings", 0, "1"), ("voxel_m", 0.0, "0.01"), ("voxel_m", np.nan, "0.01"),
-     ("expected_lidar_height_m", np.inf, "0.1")],
-)  # fmt: skip
+    [
+        ("spacing_m", -1.0, "0"),
+        ("between_m", -1.0, "0"),
+        ("headings", 0, "1"),
+        ("voxel_m", 0.0, "0.01"),
+        ("voxel_m", np.nan, "0.01"),
+        ("expected_lidar_height_m", np.inf, "0.1"),
+    ],
+)
 def test_settings_that_make_no_map_are_refused_by_name(field, value, least):
     with pytest.raises(DatasetError, match=f"{field}: {value:g} is not valid; give {least} or more") as refused:
         BuildSettings(name="none", **{field: value})

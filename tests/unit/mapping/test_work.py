@@ -136,10 +136,16 @@ def key(small_dataset):
 
 def test_all_that_parts_are_made_of_is_in_their_name(key, small_dataset, tmp_path, monkeypatch):
     found = {
-        key(), key(encoder="f"), key(settings=replace(SETTINGS, spacing_m=4.0)), key(settings=replace(SETTINGS, headings=7)),
-        key(settings=replace(SETTINGS, voxel_m=0.2)), key(settings=replace(SETTINGS, remove_weather=True)), key(threads=2),
-        key(held_out=20), key(map="another"),
-    }  # fmt: skip
+        key(),
+        key(encoder="f"),
+        key(settings=replace(SETTINGS, spacing_m=4.0)),
+        key(settings=replace(SETTINGS, headings=7)),
+        key(settings=replace(SETTINGS, voxel_m=0.2)),
+        key(settings=replace(SETTINGS, remove_weather=True)),
+        key(threads=2),
+        key(held_out=20),
+        key(map="another"),
+    }
     moved = Dataset(shutil.copytree(small_dataset.folder, tmp_path / "moved"))
     poses = moved.folder / "survey" / "poses.txt"
     poses.write_text("\n".join(poses.read_text().splitlines()[:-1]) + "\n")

@@ -67,10 +67,21 @@ def test_a_map_that_says_it_is_not_calibrated_has_no_calibration():
 @pytest.mark.parametrize(
     ("text", "what"),
     [(text, "not valid JSON") for text in (b"", b"{", b"\xff\xfe", b"\x00", b"[" * 100_000)]
-    + [(text, "the field calibrated is missing or not a boolean") for text in (
-        b"{}", b"[]", b"null", b"false", b'"calibrated"', b'{"calibrated": null}', b'{"calibrated": 0}', b'{"calibrated": "false"}')]
+    + [
+        (text, "the field calibrated is missing or not a boolean")
+        for text in (
+            b"{}",
+            b"[]",
+            b"null",
+            b"false",
+            b'"calibrated"',
+            b'{"calibrated": null}',
+            b'{"calibrated": 0}',
+            b'{"calibrated": "false"}',
+        )
+    ]
     + [(b'{"calibrated": true, "why": "x"}', "features: Field required")],
-)  # fmt: skip
+)
 def test_a_document_that_is_neither_is_refused_with_the_file_the_reason_and_what_to_do(text, what):
     with pytest.raises(BundleError) as error:
         read(text)
@@ -126,13 +137,23 @@ def test_a_standard_deviation_that_is_not_positive_is_refused(document, std):
 @pytest.mark.parametrize(
     ("path", "value"),
     [
-        (("right", "bias"), "much"), (("right", "terms"), None), (("features", 2, "mean"), "NaN"),
-        (("more",), 1), (("right", "more"), 1),
-        (("thresholds", 0, "confidence"), 1.1), (("thresholds", 0, "confidence"), -0.1), (("thresholds", 0, "false_accept_rate"), 0.0),
-        (("thresholds", 1, "false_accept_rate"), 1.0), (("site", "offset"), 1e-9), (("site", "offset"), None),
-        (("site", "slope"), 1.0), (("site", "queries"), -1), (("site", "right"), -1), (("site", "expected_calibration_error"), 2.0),
+        (("right", "bias"), "much"),
+        (("right", "terms"), None),
+        (("features", 2, "mean"), "NaN"),
+        (("more",), 1),
+        (("right", "more"), 1),
+        (("thresholds", 0, "confidence"), 1.1),
+        (("thresholds", 0, "confidence"), -0.1),
+        (("thresholds", 0, "false_accept_rate"), 0.0),
+        (("thresholds", 1, "false_accept_rate"), 1.0),
+        (("site", "offset"), 1e-9),
+        (("site", "offset"), None),
+        (("site", "slope"), 1.0),
+        (("site", "queries"), -1),
+        (("site", "right"), -1),
+        (("site", "expected_calibration_error"), 2.0),
     ],
-)  # fmt: skip
+)
 def test_a_number_that_makes_no_sense_is_refused_and_named(document, path, value):
     document["site"] = dict(SITE)
     read(document)

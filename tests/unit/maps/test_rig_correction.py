@@ -22,11 +22,22 @@ from service.maps.reader import MapBundle
 from service.maps.writer import replace_calibration, write_bundle
 
 RIG = {
-    "scale": 0.5, "offset": -1.0, "lower_only": False, "source": "drive", "measured_on": "a drive",
-    "frames": 40, "right": 20, "outside": 15,
-    "error_before": 0.2, "error_after": 0.05, "accepted": 18, "accepted_wrong": 1, "wrong_share_upper": 0.24,
-    "outside_accepted": 0, "outside_share_upper": 0.18,
-}  # fmt: skip
+    "scale": 0.5,
+    "offset": -1.0,
+    "lower_only": False,
+    "source": "drive",
+    "measured_on": "a drive",
+    "frames": 40,
+    "right": 20,
+    "outside": 15,
+    "error_before": 0.2,
+    "error_after": 0.05,
+    "accepted": 18,
+    "accepted_wrong": 1,
+    "wrong_share_upper": 0.24,
+    "outside_accepted": 0,
+    "outside_share_upper": 0.18,
+}
 
 
 def rig(**changed):
@@ -61,8 +72,9 @@ def test_a_file_without_the_field_has_no_correction(calibration_json):
 
 
 @pytest.mark.parametrize(
-    "changed", [{"scale": 0.1}, {"scale": float("nan")}, {"frames": -1}, {"wrong_share_upper": 1.2}, {"source": "guess"}]
-)  # fmt: skip
+    "changed",
+    [{"scale": 0.1}, {"scale": float("nan")}, {"frames": -1}, {"wrong_share_upper": 1.2}, {"source": "guess"}],
+)
 def test_a_correction_that_makes_no_sense_is_refused(changed):
     with pytest.raises(ValidationError):
         rig(**changed)

@@ -89,10 +89,20 @@ def test_numbers_of_another_byte_order_are_refused(arrays, name):
 
 @pytest.mark.parametrize(
     ("name", "shape"),
-    [("origin", (4,)), ("origin", (1, 3)), ("surfels", (2, 3)), ("tiles", (2, 3)), ("tiles", (8,)),
-     ("grid_frame", (3,)), ("grid_frame", (5,)), ("grid_slots", (4, 4)), ("grid_regions", (1, 2)), ("grid_blocks", (4, 4)),
-     ("grid_nearest", (3, 512))],
-)  # fmt: skip
+    [
+        ("origin", (4,)),
+        ("origin", (1, 3)),
+        ("surfels", (2, 3)),
+        ("tiles", (2, 3)),
+        ("tiles", (8,)),
+        ("grid_frame", (3,)),
+        ("grid_frame", (5,)),
+        ("grid_slots", (4, 4)),
+        ("grid_regions", (1, 2)),
+        ("grid_blocks", (4, 4)),
+        ("grid_nearest", (3, 512)),
+    ],
+)
 def test_an_array_of_another_shape_is_named(arrays, name, shape):
     arrays[name] = np.zeros(shape, arrays[name].dtype)
     refused(arrays, name, "of shape")

@@ -128,9 +128,15 @@ def test_a_prior_in_degrees_is_refused_where_the_map_does_not_know_where_it_lies
     assert error.value.field == "prior.wgs84"
 
 
-@pytest.mark.parametrize(("of_service", "of_query", "status"), [
-    (0.01, None, "LOCALIZED"), (0.001, None, "AMBIGUOUS"), (0.001, 0.01, "LOCALIZED"), (0.01, 0.001, "AMBIGUOUS"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("of_service", "of_query", "status"),
+    [
+        (0.01, None, "LOCALIZED"),
+        (0.001, None, "AMBIGUOUS"),
+        (0.001, 0.01, "LOCALIZED"),
+        (0.01, 0.001, "AMBIGUOUS"),
+    ],
+)
 def test_the_services_rate_of_false_accepts_holds_where_a_query_names_none(
     content_of: Callable[..., Any],
     calibration_json: Callable[..., Any],

@@ -35,12 +35,21 @@ def test_anything_else_is_refused(tmp_path, presented):
 @pytest.mark.parametrize(
     ("text", "told"),
     [
-        ("", "the key file is empty"), ("# none\n", "the key file is empty"), ("robot", "line 1"), (f"ok {A}\nrobot {B[:-1]}", "line 2"),
-        (f"robot {A.upper()}", "line 1"), (f"a robot {A}", "line 1"), (f"rob/ot {A}", "line 1"), (f"{A} robot", "line 1"),
-        (f"one {A}\ntwo {A}", "line 2"), (f"one {A} admin", "line 1"), (f"one {A} operator too", "line 1"), (f"one {A}\none {B}", "line 2"),
+        ("", "the key file is empty"),
+        ("# none\n", "the key file is empty"),
+        ("robot", "line 1"),
+        (f"ok {A}\nrobot {B[:-1]}", "line 2"),
+        (f"robot {A.upper()}", "line 1"),
+        (f"a robot {A}", "line 1"),
+        (f"rob/ot {A}", "line 1"),
+        (f"{A} robot", "line 1"),
+        (f"one {A}\ntwo {A}", "line 2"),
+        (f"one {A} admin", "line 1"),
+        (f"one {A} operator too", "line 1"),
+        (f"one {A}\none {B}", "line 2"),
         ("x" * (2**20 + 1), "the key file exceeds 1 MiB"),
     ],
-)  # fmt: skip
+)
 def test_a_file_that_is_none_is_named_with_its_line(tmp_path, text, told):
     with pytest.raises(KeysError, match=told) as caught:
         ring_of(tmp_path, text)
@@ -65,10 +74,17 @@ def test_new_keys_are_long_and_differ_and_get_in(tmp_path):
 @pytest.mark.parametrize(
     ("authorization", "api_key", "expected"),
     [
-        (None, None, None), ("Bearer k", None, "k"), ("bearer  k ", None, "k"), (None, "k", "k"), ("Bearer k", "x", "k"),
-        ("Basic dTpw", None, None), ("Basic dTpw", "k", "k"), ("Bearer ", "k", "k"), ("", "", None),
+        (None, None, None),
+        ("Bearer k", None, "k"),
+        ("bearer  k ", None, "k"),
+        (None, "k", "k"),
+        ("Bearer k", "x", "k"),
+        ("Basic dTpw", None, None),
+        ("Basic dTpw", "k", "k"),
+        ("Bearer ", "k", "k"),
+        ("", "", None),
     ],
-)  # fmt: skip
+)
 def test_a_key_comes_in_either_header(authorization, api_key, expected):
     assert presented_key(authorization, api_key) == expected
 

@@ -13,11 +13,23 @@ from model_training.simulation.terrain import Terrain
 
 #: The paper's Table I, written off by hand.
 PAPER_CLASSES = {
-    "Beginning of street 1": 56, "End of street 1": 54, "Beginning of street 2": 22, "End of street 2": 67, "Street 3": 11,
-    "Beginning of street 4": 38, "End of street 4": 25, "Beginning of street 5": 76, "End of street 5": 37, "Street 6": 34,
-    "Beginning of street 7": 53, "End of street 7": 32, "Street 8": 49, "Beginning of street 9": 20, "End of street 9": 21,
+    "Beginning of street 1": 56,
+    "End of street 1": 54,
+    "Beginning of street 2": 22,
+    "End of street 2": 67,
+    "Street 3": 11,
+    "Beginning of street 4": 38,
+    "End of street 4": 25,
+    "Beginning of street 5": 76,
+    "End of street 5": 37,
+    "Street 6": 34,
+    "Beginning of street 7": 53,
+    "End of street 7": 32,
+    "Street 8": 49,
+    "Beginning of street 9": 20,
+    "End of street 9": 21,
     "Between": 31,
-}  # fmt: skip
+}
 
 
 NETWORKS = [paper_streets(np.random.default_rng(0))]
