@@ -23,9 +23,8 @@ from service.registration.kernel import STATE, QueryPoints
 from service.registration.points import blocks_of, points_from
 from service.registration.register import RegistrationSettings, Start, register, registered_of, score
 from service.registration.surfel_map import SurfelMap
-from service.retrieval.frame import Frame
 from service.retrieval.knn import distinct_places
-from service.retrieval.retrieve import RANKED
+from service.retrieval.retrieve import RANKED, Frame
 from service.retrieval.starts import starts_from
 
 #: Largest error of a right level. Registration starts from it and corrects about this much.

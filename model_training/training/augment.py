@@ -13,9 +13,8 @@ from pydantic import BaseModel, ConfigDict
 from torch import Tensor
 from torch.nn import functional
 
-from service.imaging.brightness import FLOOR, LEAST_SPREAD, LIMIT
-from service.imaging.ihs import IHS_FROM_RGB
-from service.imaging.view_grid import PLANES, ViewGrid
+from service.imaging.fusion import IHS_FROM_RGB
+from service.imaging.view_grid import BRIGHTNESS_FLOOR, BRIGHTNESS_LIMIT, LEAST_BRIGHTNESS_SPREAD, PLANES, ViewGrid
 from service.registration.points import FOCAL_BASELINE_PX_M
 
 
@@ -302,7 +301,7 @@ def least_of_nine(values: Tensor) -> Tensor:
 
 
 def brightness(values: Tensor, *, measured: Tensor, seen: Tensor) -> Tensor:
-    """Return ``service.imaging.brightness`` of a batch: standard deviations from the mean of each view.
+    """Return ``service.imaging.view_grid.brightness`` of a batch: standard deviations from the mean of each view.
 
     Args:
         values: grey level or intensity (B, rows, columns).
@@ -310,7 +309,7 @@ def brightness(values: Tensor, *, measured: Tensor, seen: Tensor) -> Tensor:
         seen: cells that get a value (B, rows, columns); the others become 0.
 
     Returns:
-        Brightness (B, rows, columns), clamped to +-``LIMIT``; 0 in views with too little contrast.
+        Brightness (B, rows, columns), clamped to +-``BRIGHTNESS_LIMIT``; 0 in views with too little contrast.
     """
     weight = measured.to(values.dtype)
     count = weight.sum(dim=(1, 2), keepdim=True).clamp(min=1)
@@ -319,10 +318,12 @@ def brightness(values: Tensor, *, measured: Tensor, seen: Tensor) -> Tensor:
         return (of * weight).sum(dim=(1, 2), keepdim=True) / count
 
     level = mean(values)
-    logarithm = torch.log(values / level.clamp(min=1e-9) + FLOOR)
+    logarithm = torch.log(values / level.clamp(min=1e-9) + BRIGHTNESS_FLOOR)
     middle = mean(logarithm)
     spread = mean((logarithm - middle) ** 2).sqrt()
-    told = seen & (level > 0) & (spread >= LEAST_SPREAD)
+    told = seen & (level > 0) & (spread >= LEAST_BRIGHTNESS_SPREAD)
     return torch.where(
-        told, ((logarithm - middle) / spread.clamp(min=1e-6)).clamp(-LIMIT, LIMIT), torch.zeros_like(values)
+        told,
+        ((logarithm - middle) / spread.clamp(min=1e-6)).clamp(-BRIGHTNESS_LIMIT, BRIGHTNESS_LIMIT),
+        torch.zeros_like(values),
     )

@@ -16,9 +16,9 @@ from service.confidence.shape import Shape, shape_of
 from service.errors import BundleError
 from service.imaging.view_grid import ViewGrid
 from service.maps.calibration import Calibration
-from service.retrieval.frame import Frame
 from service.retrieval.hypotheses import Hypothesis
 from service.retrieval.knn import Neighbour
+from service.retrieval.retrieve import Frame
 from service.scoring.candidates import Candidate, Refined, behind, distinct_candidates, log_shares
 
 #: A neighbour further than OTHER_PLACE_M from the answer is another place (feature ``similarity_margin``).

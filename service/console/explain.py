@@ -18,8 +18,8 @@ from service.maps.reader import MapBundle
 from service.registration.kernel import render
 from service.registration.register import Registered
 from service.registration.surfel_map import TILE_M, SurfelMap
-from service.retrieval.frame import Frame
 from service.retrieval.query import Query
+from service.retrieval.retrieve import Frame
 from service.runtime.engine import EncodedQuery, Engine, Located
 from service.runtime.memory import EXPLAIN_PEAK
 from service.scoring.rendered_depth import REACH_M, SURFEL_M

@@ -9,12 +9,11 @@ from numpy.typing import NDArray
 from service.errors import NoDepthError
 from service.geometry.camera import PinholeCamera
 from service.geometry.rigid import Rotation, rotation_z
-from service.imaging.brightness import brightness
 from service.imaging.depth_unit_hint import unit_hint
 from service.imaging.fusion import fuse
 from service.imaging.gather import gather
 from service.imaging.level import GivenHeight, HeightOrigin, level_query
-from service.imaging.view_grid import PLANES, Planes, ViewGrid, heights_of
+from service.imaging.view_grid import PLANES, Planes, ViewGrid, brightness, heights_of
 
 
 @dataclass(frozen=True, slots=True)

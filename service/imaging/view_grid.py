@@ -11,15 +11,19 @@ import numpy as np
 from jaxtyping import Bool, Float32, Float64
 from numpy.typing import NDArray
 
-from service.imaging.brightness import brightness
-
 #: Input planes of the encoder, in this order: range (m), which replaces the intensity. V1 and V2 (grey levels, eq. 9; 0 without
 #: colour). Height above the local ground (m). 1 where the sensor could have measured. Brightness of the LiDAR return or of the
-#: image (``service.imaging.brightness``, standard deviations).
+#: image (``brightness``, standard deviations).
 PLANES = ("range_m", "v1", "v2", "height_m", "observed", "brightness")
 
 #: Largest valid range of the default grid, metres. Images of depth for people end there too.
 MAX_RANGE_M = 40.0
+#: Offset under the logarithm of brightness, as a share of the mean. All values well below it count as equally black.
+BRIGHTNESS_FLOOR = 0.03
+#: Smallest standard deviation of this logarithm. A flatter view carries no information, e.g. from a sensor without intensity.
+LEAST_BRIGHTNESS_SPREAD = 0.05
+#: Largest absolute brightness, standard deviations.
+BRIGHTNESS_LIMIT = 3.0
 
 Ranges = Float32[NDArray[np.float32], "rows columns"]
 #: Range (m) and intensity (unit of the sensor) of a LiDAR over 360 degrees.
@@ -204,3 +208,37 @@ def heights_of(
     """
     sine = np.sin(grid.elevations_rad).astype(np.float32)[:, None]
     return np.where(ranges > 0, ranges * sine + np.float32(sensor_height_m), np.float32(0))
+
+
+def brightness(
+    values: Float32[NDArray[np.float32], "rows columns"],
+    *,
+    measured: Bool[NDArray[np.bool_], "rows columns"],
+    seen: Bool[NDArray[np.bool_], "rows columns"],
+) -> Float32[NDArray[np.float32], "rows columns"]:
+    """Normalise the brightness of a view to standard deviations from its mean: a cue that LiDAR intensity and grey level share.
+
+    The two have no common scale. Exposure, gamma and the calibration of the sensor differ. So the logarithm is normalised: its mean
+    is subtracted, and the result is divided by its standard deviation. Both are taken over the cells with a range. The result does
+    not change if a gain or a gamma changes (decision 0023).
+
+    Args:
+        values: intensity of LiDAR returns, or of an image (paper, eq. 9). Not negative, any scale.
+        measured: cells with a range. Mean and standard deviation are taken over these cells.
+        seen: cells whose value is valid. The sky of an image has a brightness and no range.
+
+    Returns:
+        Brightness in standard deviations, clipped to +-3. It is 0 outside ``seen``. It is 0 everywhere if the measured cells
+        have no positive mean, or if their logarithm varies less than ``LEAST_BRIGHTNESS_SPREAD``.
+    """
+    of_measured = values[measured]
+    mean = float(of_measured.mean()) if of_measured.size else 0.0
+    if not mean > 0:
+        return np.zeros_like(values)
+    logarithm = np.log(values / np.float32(mean) + np.float32(BRIGHTNESS_FLOOR))
+    middle, spread = float(logarithm[measured].mean()), float(logarithm[measured].std())
+    if spread < LEAST_BRIGHTNESS_SPREAD:
+        return np.zeros_like(values)
+    scaled = np.clip((logarithm - np.float32(middle)) / np.float32(spread), -BRIGHTNESS_LIMIT, BRIGHTNESS_LIMIT)
+    result: Float32[NDArray[np.float32], "rows columns"] = np.where(seen, scaled, np.float32(0))
+    return result

@@ -1,22 +1,42 @@
 """Build the answer from the results of the stages."""
 
-import numpy as np
+from dataclasses import dataclass
 
-from service.confidence.decision import outcome_of
+import numpy as np
+from jaxtyping import Float64
+from numpy.typing import NDArray
+
+from service.confidence.decision import Decision, outcome_of
 from service.confidence.spread import Extent
 from service.geometry.rigid import Transform, inverse, transform_from
 from service.imaging.query_view import QueryViews
 from service.localization.answer import Answer, Timings, require_finite
-from service.localization.found import Found
 from service.maps.reader import MapBundle
-from service.retrieval.frame import Frame
 from service.retrieval.hypotheses import Hypothesis
 from service.retrieval.knn import Neighbour
-from service.scoring.candidates import Candidate
+from service.retrieval.retrieve import Frame, Retrieved
+from service.scoring.candidates import Candidate, Refined
 from service.timing import StageTimer
 
 #: Largest distance at which a registered pose verifies a place.
 VERIFIED_M = 5.0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Found:
+    """What a query has found before its answer is built.
+
+    Attributes:
+        retrieved: places, clusters and street vote of the reference.
+        refined: registered candidates; None if nothing was registered.
+        evidence: confidence features; None without ``refined``.
+        decision: status and confidence; None if the query asked for no registration, or the map has no cloud or no calibration.
+    """
+
+    retrieved: Retrieved
+    refined: Refined | None
+    evidence: Float64[NDArray[np.float64], " F"] | None
+    decision: Decision | None
 
 
 def compose(bundle: MapBundle, frames: tuple[Frame, ...], found: Found, extent: Extent, timer: StageTimer) -> Answer:

@@ -9,15 +9,13 @@ from service.confidence.features import evidence_of, require_features
 from service.confidence.spread import Extent
 from service.geometry.rigid import Transform
 from service.localization.answer import Answer
-from service.localization.compose import compose
-from service.localization.found import Found
+from service.localization.compose import Found, compose
 from service.localization.refine import RefineSettings, refine
 from service.maps.reader import MapBundle
 from service.retrieval.encoder import Encoder, Provider
-from service.retrieval.frame import Frame
 from service.retrieval.hypotheses import ClusterSettings
 from service.retrieval.query import Query
-from service.retrieval.retrieve import look_up, require_encoder_of, retrieve
+from service.retrieval.retrieve import Frame, look_up, require_encoder_of, retrieve
 from service.timing import StageTimer
 
 

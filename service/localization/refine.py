@@ -23,8 +23,8 @@ from service.registration.rays import RaySettings, adjust
 from service.registration.register import RegistrationSettings, Start, register
 from service.registration.surfel_map import SurfelMap
 from service.registration.visibility import SurfelRaycaster
-from service.retrieval.frame import Frame
 from service.retrieval.prior import Prior
+from service.retrieval.retrieve import Frame
 from service.retrieval.starts import StartSettings, starts_from
 from service.scoring.candidates import Candidate, Refined
 from service.scoring.measured import MeasuredFrame, measure, merged_points

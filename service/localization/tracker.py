@@ -12,10 +12,10 @@ from service.confidence.extrapolation import extrapolated
 from service.geometry.rigid import Transform, inverse, nearest_rigid
 from service.localization.answer import Answer, require_finite
 from service.localization.belief import Belief, Mode, Seen, agrees, moved, sighting_of, size_of
-from service.localization.found import Found
+from service.localization.compose import Found
 from service.localization.localizer import Localizer
 from service.option_limits import FALSE_ACCEPT_RATE
-from service.retrieval.frame import Frame
+from service.retrieval.retrieve import Frame
 from service.scoring.candidates import RIVAL_M, Candidate, distinct_candidates, shares_of
 from service.timing import StageTimer
 

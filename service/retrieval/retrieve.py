@@ -3,16 +3,18 @@
 from dataclasses import dataclass
 
 import numpy as np
+from jaxtyping import Float32
+from numpy.typing import NDArray
 
 from service.errors import BundleError
-from service.imaging.query_view import query_views
+from service.geometry.rigid import Rotation, Transform, transform_from
+from service.imaging.query_view import QueryViews, query_views
 from service.imaging.view_grid import ViewGrid
 from service.maps.reader import MapBundle
 from service.registration.points import inverse_depth_noise
 from service.retrieval.encoder import Encoder
-from service.retrieval.frame import Frame
 from service.retrieval.hypotheses import ClusterSettings, Hypothesis, cluster, rerank_with_prior
-from service.retrieval.knn import Neighbour, StreetVote, distinct_places, search_views, vote
+from service.retrieval.knn import Neighbour, StreetVote, ViewMatches, distinct_places, search_views, vote
 from service.retrieval.query import Query
 from service.timing import StageTimer
 
@@ -22,6 +24,46 @@ TURN_RAD = float(np.deg2rad(5.0))
 
 #: Smallest number of distinct places to find. Registration starts from several of them.
 RANKED = 40
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Frame:
+    """An image pair with the results of the map search.
+
+    Attributes:
+        query: image pair, camera and options.
+        T_reference_camera: pose of this camera in the camera frame of the reference; identity for the reference itself.
+        views: query views, one per turn.
+        descriptors: descriptors of the views, one row per turn.
+        matches: most similar map views, the best first.
+        noise: standard deviation of the inverse depth of one pixel, 1/m.
+        independent_noise: the same without the correlated error that adjacent pixels share, 1/m.
+    """
+
+    query: Query
+    T_reference_camera: Transform
+    views: QueryViews
+    descriptors: Float32[NDArray[np.float32], "T D"]
+    matches: ViewMatches
+    noise: float
+    independent_noise: float
+
+    @property
+    def R_level_camera(self) -> Rotation:
+        """Rotation from the camera's optical frame to the level frame."""
+        return self.views.R_level_camera
+
+    def T_reference_level(self, reference: "Frame") -> Transform:
+        """Compute the pose of this frame's level frame in the level frame of the reference.
+
+        The origin of each level frame is at its camera.
+
+        Args:
+            reference: reference frame of the query.
+        """
+        T_reference_camera, R_level_reference = self.T_reference_camera, reference.R_level_camera
+        R = R_level_reference @ T_reference_camera[:3, :3] @ self.R_level_camera.T
+        return transform_from(R, R_level_reference @ T_reference_camera[:3, 3])
 
 
 @dataclass(frozen=True, slots=True, eq=False)

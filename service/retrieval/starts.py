@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 
 from service.geometry.rigid import inverse
 from service.registration.register import Start
-from service.retrieval.frame import Frame
 from service.retrieval.prior import Prior
+from service.retrieval.retrieve import Frame
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -18,9 +18,9 @@ from service.localization.track_bytes import packed, unpacked
 from service.localization.tracker import Track, follow
 from service.maps.reader import MapBundle
 from service.option_limits import NEIGHBOURS
-from service.retrieval.frame import Frame
 from service.retrieval.prior import Prior
 from service.retrieval.query import DepthFormat, Query, decoded_query
+from service.retrieval.retrieve import Frame
 from service.runtime.admission import Admission
 from service.runtime.last_answers import LastAnswers
 from service.runtime.map_registry import MapRegistry

@@ -11,7 +11,7 @@ from service.registration.kernel import QueryPoints
 from service.registration.points import DepthBlocks, PointSettings, blocks_of, movable_of, points_from
 from service.registration.rays import RayPicture, picture_of
 from service.registration.register import Registered
-from service.retrieval.frame import Frame
+from service.retrieval.retrieve import Frame
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -21,9 +21,9 @@ from service.maps.content import BundleContent
 from service.maps.reader import MapBundle
 from service.maps.writer import write_bundle
 from service.registration.surfel_map import SurfelMap
-from service.retrieval.frame import Frame
 from service.retrieval.knn import ViewMatches
 from service.retrieval.query import Query
+from service.retrieval.retrieve import Frame
 from tests.unit.street_scene import (  # noqa: F401  # fixtures for the tests of several packages
     candidate,
     points_at,

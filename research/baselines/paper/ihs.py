@@ -4,7 +4,7 @@ Fusion replaces I and keeps V1 and V2, so neither the product nor the paper's me
 
 The two forms differ in the scale of I and in the zero of the hue:
 
-- Linear (``service.imaging.ihs``): I = (R + G + B) / sqrt(3). White has I = sqrt(3) for RGB in 0..1, and 441.67 for RGB in 0..255.
+- Linear (``service.imaging.fusion``): I = (R + G + B) / sqrt(3). White has I = sqrt(3) for RGB in 0..1, and 441.67 for RGB in 0..255.
   The hue is 0 at blue and passes green before red.
 - Geometric: I = (R + G + B) / 3. White has I = 1 for RGB in 0..1, and 255 for RGB in 0..255.
   The hue is 0 at red and passes green before blue.

@@ -4,7 +4,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from service.imaging.brightness import FLOOR, LIMIT, brightness
+from service.imaging.view_grid import BRIGHTNESS_FLOOR, BRIGHTNESS_LIMIT, brightness
 
 ALL = np.ones((1, 4), np.bool_)
 VALUES = arrays(np.float32, (4, 6), elements=st.floats(0.0, 255.0, width=32))
@@ -22,8 +22,8 @@ def test_two_levels_stand_one_spread_to_either_side():
 
 def test_mean_and_spread_are_worked_out_over_measured_cells():
     measured = np.array([[True, True, True, False]])
-    logarithms = np.log(np.array([1.0, 2.0, 6.0]) / 3.0 + FLOOR)
-    expected = (np.log(10.0 / 3.0 + FLOOR) - logarithms.mean()) / logarithms.std()
+    logarithms = np.log(np.array([1.0, 2.0, 6.0]) / 3.0 + BRIGHTNESS_FLOOR)
+    expected = (np.log(10.0 / 3.0 + BRIGHTNESS_FLOOR) - logarithms.mean()) / logarithms.std()
     assert of([1.0, 2.0, 6.0, 10.0], measured)[0, 3] == pytest.approx(expected, abs=1e-4)
 
 
@@ -36,7 +36,7 @@ def test_the_scale_does_not_matter(values, scale):
 def test_it_stays_within_its_limit(values):
     found = of(values)
     assert np.isfinite(found).all()
-    assert np.abs(found).max() <= LIMIT
+    assert np.abs(found).max() <= BRIGHTNESS_LIMIT
 
 
 def test_cells_outside_the_view_are_zero():

@@ -6,8 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from service.imaging.fusion import fuse, picture_of
-from service.imaging.ihs import ihs_linear
+from service.imaging.fusion import fuse, ihs_linear, picture_of
 
 GOLDEN = Path(__file__).parents[2] / "golden" / "imaging"
 

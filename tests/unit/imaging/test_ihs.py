@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from service.imaging.ihs import IHS_FROM_RGB, ihs_linear, rgb_from_linear
+from service.imaging.fusion import IHS_FROM_RGB, ihs_linear, rgb_from_linear
 
 COLOURS = arrays(np.float64, (5, 3), elements=st.floats(0.0, 1.0, allow_subnormal=False))
 RED, GREEN, BLUE = (1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)

@@ -12,16 +12,15 @@ from service.confidence.decision import Decision, Status
 from service.geometry.rigid import transform_from
 from service.localization import tracker
 from service.localization.belief import KIDNAPPED, KIDNAPPED_ON_THE_WAY, NEW_M
-from service.localization.found import Found
+from service.localization.compose import Found
 from service.localization.localizer import Localizer
 from service.localization.track_bytes import MOST_BYTES, packed, unpacked
 from service.localization.tracker import MOST_FRAMES, Track, follow
 from service.maps.reader import MapBundle
 from service.registration.register import Registered
-from service.retrieval.frame import Frame
 from service.retrieval.prior import Prior
 from service.retrieval.query import Query
-from service.retrieval.retrieve import Retrieved
+from service.retrieval.retrieve import Frame, Retrieved
 from service.scoring.candidates import Candidate, Refined
 from service.timing import StageTimer
 

@@ -4,9 +4,9 @@ import pytest
 torch = pytest.importorskip("torch", reason="needs the extra `training`")
 
 from model_training.training.augment import Augmentation, Augmenter, brightness, least_of_nine  # noqa: E402  # after the skip
-from service.imaging.brightness import brightness as of_one_view  # noqa: E402
-from service.imaging.ihs import ihs_linear  # noqa: E402
+from service.imaging.fusion import ihs_linear  # noqa: E402
 from service.imaging.view_grid import PLANES, ViewGrid, heights_of  # noqa: E402
+from service.imaging.view_grid import brightness as of_one_view  # noqa: E402
 
 GRID = ViewGrid()
 COUNT = 300

@@ -12,7 +12,7 @@ from research.baselines.paper.ihs import (
     planes_from_hue_saturation,
     rgb_from_geometric,
 )
-from service.imaging.ihs import ihs_linear
+from service.imaging.fusion import ihs_linear
 
 UNIT = st.floats(0.0, 1.0, allow_subnormal=False)
 COLOURS = arrays(np.float64, (5, 3), elements=UNIT)
