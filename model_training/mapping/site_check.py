@@ -18,7 +18,7 @@ from service.geometry.camera import PinholeCamera
 from service.geometry.rigid import R_BODY_OPTICAL, rotation_z, transform_from
 from service.imaging.view_grid import ViewGrid, panorama_from_points
 from service.localization.localizer import Localizer
-from service.maps.calibration import Calibration, Site, probability
+from service.maps.calibration import RIGHT_M, Calibration, Site, probability
 from service.maps.content import BundleContent
 from service.maps.reader import MapBundle
 from service.maps.writer import write_bundle
@@ -34,8 +34,6 @@ _CAMERA = PinholeCamera(320, 240, 160.0, 160.0, 159.5, 119.5)
 _NOISE_PX, _FOCAL_BASELINE = (0.1, 0.5), 80.0
 #: Largest depth of a rendered query, metres.
 _LARGEST_M = 60.0
-#: Largest error of a right answer, metres on the ground.
-_RIGHT_M = 1.0
 #: Standard deviation of the prior of the offset, in log odds (decision 0030).
 _PRIOR_OFFSET = 1.0
 #: Progress callback: stage, finished steps, all steps.
@@ -93,7 +91,7 @@ def site_of(
             answer = localizer.localize(query)
             odds = None if answer.evidence is None else float(calibration.log_odds("right", answer.evidence))
             confidence.append(-30.0 if odds is None else odds)
-            right.append(float(np.linalg.norm(answer.T_map_camera_guess[:2, 3] - T_map_camera[:2, 3])) <= _RIGHT_M)
+            right.append(float(np.linalg.norm(answer.T_map_camera_guess[:2, 3] - T_map_camera[:2, 3])) <= RIGHT_M)
             report("site check", number + 1, len(held))
     odds_of, is_right = np.array(confidence), np.array(right)
     offset = min(0.0, _offset(odds_of, is_right))

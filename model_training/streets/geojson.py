@@ -15,14 +15,13 @@ from shapely.geometry.base import BaseGeometry, BaseMultipartGeometry
 
 from model_training.streets.corridor import corridor
 from model_training.streets.map_frame import FARTHEST_M, MapFrame
-from model_training.streets.named_street import LARGEST_M, NamedStreet, Section, StreetSource
+from model_training.streets.named_street import LARGEST_BYTES, LARGEST_M, NamedStreet, Section, StreetSource
 from service.errors import DatasetError
 
 #: Width of a centre line without its own width, metres.
 DEFAULT_WIDTH_M = 8.0
 #: Greatest width that is accepted, metres.
 WIDEST_M = 500.0
-_LARGEST_BYTES = 256 * 2**20
 #: Names of WGS-84 in the ``crs`` of older files. RFC 7946 always uses WGS-84.
 _WGS84 = ("urn:ogc:def:crs:OGC:1.3:CRS84", "urn:ogc:def:crs:OGC::CRS84", "OGC:CRS84")
 ToMap = Callable[[NDArray[np.float64]], NDArray[np.float64]]
@@ -97,9 +96,9 @@ def _load(path: Path) -> dict[str, Any]:
         raise ValueError(f"{word} is not a valid JSON number")
 
     try:
-        if path.stat().st_size > _LARGEST_BYTES:
+        if path.stat().st_size > LARGEST_BYTES:
             raise DatasetError(
-                f"{path}: larger than {_LARGEST_BYTES} bytes; reduce it to the surroundings of the survey",
+                f"{path}: larger than {LARGEST_BYTES} bytes; reduce it to the surroundings of the survey",
                 field=path.name,
             )
         document = json.loads(path.read_bytes(), parse_constant=refuse)

@@ -12,6 +12,8 @@ Section = Literal["beginning", "end"]
 Lanes = Literal["driving", "all"]
 #: Greatest coordinate, metres; no projection has larger ones. GEOS does not terminate on some larger coordinates.
 LARGEST_M = 1e8
+#: Largest file of streets that is read. CARLA's largest town has 70 MB.
+LARGEST_BYTES = 256 * 2**20
 
 
 @dataclass(frozen=True, slots=True)

@@ -5,10 +5,8 @@ from typing import NoReturn
 from xml.etree.ElementTree import Element, TreeBuilder
 from xml.parsers import expat
 
+from model_training.streets.named_street import LARGEST_BYTES
 from service.errors import DatasetError
-
-#: Largest file that is read. CARLA's largest town has 70 MB.
-LARGEST_BYTES = 256 * 2**20
 
 
 def read_xml(path: Path, *, root: str, largest_bytes: int = LARGEST_BYTES) -> Element:

@@ -23,6 +23,8 @@ from service.geometry.rigid import Transform
 Localize = Callable[[NDArray[np.uint8], NDArray[np.float32], PinholeCamera], LocalizeAnswer]
 #: Number of queries over which the reported rate is averaged.
 _RECENT = 10
+#: Longest time without images and without a diagnosis, seconds; a slow query rate makes it longer.
+IDLE_S = 1.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -101,8 +103,8 @@ class Bridge:
         return None if pair is None else self._ask(pair)
 
     def quiet_s(self) -> float:
-        """Return the seconds without a query that the rate limit explains; a longer silence means missing images."""
-        return 2.0 / self.gate.rate_hz if self.gate.rate_hz else 0.0
+        """Return the longest time without a query, seconds, that is no lack of images: ``IDLE_S``, or two periods of a slow rate."""
+        return max(IDLE_S, 2.0 / self.gate.rate_hz) if self.gate.rate_hz else IDLE_S
 
     def idle(self) -> Diagnosis:
         """Build the diagnosis for a time without image pairs."""

@@ -14,8 +14,8 @@ from service.runtime.wakeup import Wakeup
 
 #: Name of the node.
 NODE = "streetfix_bridge"
-#: Seconds between two checks for images, and minimum seconds without a query until an idle diagnosis is published.
-_LOOK_S, _IDLE_S = 0.05, 1.0
+#: Seconds between two checks for images.
+_LOOK_S = 0.05
 
 
 @contextmanager
@@ -126,7 +126,7 @@ def spin(
                 poses.publish(filled_pose(PoseWithCovarianceStamped(), published.pose))
             diagnoses.publish(filled_diagnostics(DiagnosticArray(), published.diagnosis, now))
             callback(published)
-        elif bridge.clock() - spoken_s < max(_IDLE_S, bridge.quiet_s()):
+        elif bridge.clock() - spoken_s < bridge.quiet_s():
             continue
         else:
             diagnoses.publish(filled_diagnostics(DiagnosticArray(), bridge.idle(), now))

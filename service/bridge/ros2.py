@@ -14,15 +14,13 @@ from cyclonedds.topic import Topic
 from cyclonedds.util import duration
 
 from service.bridge import messages
-from service.bridge.bridge import Bridge, Published
+from service.bridge.bridge import IDLE_S, Bridge, Published
 from service.bridge.diagnostics import NAME, Diagnosis
 from service.bridge.pose import StampedPose
 from service.errors import AddressError
 from service.runtime.wakeup import Wakeup
 
 M = TypeVar("M", bound=IdlStruct)
-#: Maximum seconds between two diagnoses without images; longer only for a slow query rate.
-IDLE_S = 1.0
 #: Maximum seconds until a signal is noticed.
 _LOOK_S = 0.2
 #: Data representation of ROS 2 on the wire.
@@ -103,7 +101,7 @@ class DdsNode:
                     self._publish(published)
                     callback(published)
                     spoken_s = time.monotonic()
-            if time.monotonic() - spoken_s >= max(IDLE_S, self._bridge.quiet_s()):
+            if time.monotonic() - spoken_s >= self._bridge.quiet_s():
                 self._say(self._bridge.idle())
                 spoken_s = time.monotonic()
 

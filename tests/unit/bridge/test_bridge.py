@@ -4,7 +4,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from service.bridge.bridge import Bridge, line_of
+from service.bridge.bridge import IDLE_S, Bridge, line_of
 from service.bridge.diagnostics import Level
 from service.bridge.gate import Gate
 from service.contract.schema import LocalizeAnswer
@@ -111,7 +111,7 @@ def test_without_a_limit_every_pair_has_its_turn(robot: Robot) -> None:
     while (published := bridge.step()) is not None:
         stamps.append(published.diagnosis.stamp_ns // S)
     assert stamps == [1, 2, 3]
-    assert bridge.quiet_s() == 0.0
+    assert bridge.quiet_s() == IDLE_S
 
 
 @pytest.mark.parametrize(
