@@ -136,7 +136,12 @@ def check_distortion(camera: Camera) -> Finding:
     """
     lens = camera_of(camera)
     if not lens.is_distorted:
-        return Finding("distortion", "ok", "none given: both images must be rectified")
+        return Finding(
+            "distortion",
+            "ok",
+            "none given, so both images must be rectified",
+            "if straight walls look curved near the border of an image, send camera.distortion and camera.distortion_model",
+        )
     try:
         rectification_of(lens)
     except StreetfixError as error:

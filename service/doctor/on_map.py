@@ -1,7 +1,5 @@
 """Checks of an image pair on a map: the rows that both sensors see, and the answer."""
 
-from dataclasses import replace
-
 import numpy as np
 from jaxtyping import Bool
 from numpy.typing import NDArray
@@ -14,8 +12,7 @@ from service.imaging.level import level_query
 from service.localization.answer import Answer
 from service.localization.localizer import Localizer
 from service.maps.reader import MapBundle
-from service.retrieval.query import DepthFormat, decoded_query
-from service.runtime.engine import prior_in
+from service.runtime.engine import query_in
 
 #: Share of the camera's rows that the LiDAR must see.
 LEAST_OVERLAP = 0.5
@@ -89,27 +86,7 @@ def answer_of(pair: Pair, localizer: Localizer, false_accept_rate: float) -> Ans
     Raises:
         StreetfixError: the service would refuse the query.
     """
-    encoded, bundle = pair.encoded, localizer.bundle
-    form = DepthFormat(
-        encoding=encoded.depth_encoding,
-        kind=encoded.depth_kind,
-        scale_m=encoded.scale_m,
-        baseline_m=encoded.baseline_m,
-        max_range_m=encoded.max_range_m,
-    )
-    query = decoded_query(encoded.rgb, encoded.depth, encoded.camera, form, grid=bundle.grid)
-    return localizer.localize(
-        replace(
-            query,
-            down_camera=encoded.down_camera,
-            camera_height=encoded.camera_height,
-            T_vehicle_camera=encoded.T_vehicle_camera,
-            neighbours=encoded.neighbours,
-            refine=encoded.refine,
-            prior=prior_in(encoded, bundle),
-            false_accept_rate=encoded.false_accept_rate or false_accept_rate,
-        )
-    )
+    return localizer.localize(query_in(pair.encoded, localizer.bundle, false_accept_rate))
 
 
 def check_answer(pair: Pair, localizer: Localizer, false_accept_rate: float) -> Finding:

@@ -1,6 +1,5 @@
 """The composition root: builds a running engine from the settings. Both request handlers call only this module."""
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -11,7 +10,7 @@ from service.errors import BundleError, RequestError, StreetfixError
 from service.geometry.camera import PinholeCamera
 from service.imaging.decode import DepthEncoding, DepthKind, ImageLimits
 from service.imaging.level import GivenHeight
-from service.imaging.view_grid import ViewGrid
+from service.imaging.picture_headers import DEFAULT_LIMITS
 from service.localization.answer import Answer
 from service.localization.localizer import Localizer
 from service.localization.track_bytes import packed, unpacked
@@ -289,43 +288,29 @@ class Engine:
             StreetfixError: as for ``localize``.
         """
         with timer.stage("decode"):
-            query = replace(self._decode(encoded, localizer.bundle.grid), prior=prior_in(encoded, localizer.bundle))
+            query = self._decode(encoded, localizer.bundle)
         return localizer.look_up(query, timer)
 
     def close(self) -> None:
         """Wait for running requests and drop waiting ones."""
         self.admission.close()
 
-    def _decode(self, encoded: EncodedQuery, grid: ViewGrid) -> Query:
+    def _decode(self, encoded: EncodedQuery, bundle: MapBundle) -> Query:
         """Decode both images. Their memory stays reserved until the depth image is deleted."""
         converted = encoded.depth_kind == "range" or encoded.depth_encoding == "carla"
         of_pixel = {"rgb": RGB_PEAK, "depth": DEPTH_PEAK_CONVERTED if converted else DEPTH_PEAK}
         with self.memory.hold() as hold:
             hold.grow(len(encoded.rgb) + len(encoded.depth))
-            query = self._decoded(encoded, grid, lambda field, pixels: hold.grow(pixels * of_pixel[field]))
+            limits = self.settings.limits
+            image_limits = ImageLimits(
+                max_bytes=limits.max_part_bytes,
+                max_pixels=limits.max_pixels,
+                reserve=lambda field, pixels: hold.grow(pixels * of_pixel[field]),
+            )
+            query = query_in(encoded, bundle, self.settings.false_accept_rate, limits=image_limits)
             hold.shrink_to(query.rgb.nbytes + query.depth_m.size * DEPTH_KEPT)
             hold.leave_with(query.depth_m)
         return query
-
-    def _decoded(self, encoded: EncodedQuery, grid: ViewGrid, reserve: Callable[[str, int], None]) -> Query:
-        limits = self.settings.limits
-        image_limits = ImageLimits(max_bytes=limits.max_part_bytes, max_pixels=limits.max_pixels, reserve=reserve)
-        depth_format = DepthFormat(
-            encoding=encoded.depth_encoding,
-            kind=encoded.depth_kind,
-            scale_m=encoded.scale_m,
-            baseline_m=encoded.baseline_m,
-            max_range_m=encoded.max_range_m,
-        )
-        return replace(
-            decoded_query(encoded.rgb, encoded.depth, encoded.camera, depth_format, grid=grid, limits=image_limits),
-            down_camera=encoded.down_camera,
-            camera_height=encoded.camera_height,
-            T_vehicle_camera=encoded.T_vehicle_camera,
-            neighbours=encoded.neighbours,
-            refine=encoded.refine,
-            false_accept_rate=encoded.false_accept_rate or self.settings.false_accept_rate,
-        )
 
 
 def warm_up(false_accept_rate: float, localizer: Localizer) -> None:
@@ -354,6 +339,40 @@ def warm_up(false_accept_rate: float, localizer: Localizer) -> None:
     rgb = rng.integers(0, 255, (48, 64, 3), np.uint8)
     depth_m = rng.uniform(2.0, 20.0, (48, 64)).astype(np.float32)
     localizer.localize(Query(rgb=rgb, depth_m=depth_m, camera=camera, false_accept_rate=false_accept_rate))
+
+
+def query_in(
+    encoded: EncodedQuery, bundle: MapBundle, false_accept_rate: float, *, limits: ImageLimits = DEFAULT_LIMITS
+) -> Query:
+    """Decode both images, and return the query with its options.
+
+    Args:
+        encoded: the query.
+        bundle: the map; it gives the view grid and the place of a prior on the Earth.
+        false_accept_rate: setting of the service for requests that give none.
+        limits: largest size of each image.
+
+    Raises:
+        StreetfixError: as ``decoded_query`` and ``prior_in``.
+    """
+    depth_format = DepthFormat(
+        encoding=encoded.depth_encoding,
+        kind=encoded.depth_kind,
+        scale_m=encoded.scale_m,
+        baseline_m=encoded.baseline_m,
+        max_range_m=encoded.max_range_m,
+    )
+    query = decoded_query(encoded.rgb, encoded.depth, encoded.camera, depth_format, grid=bundle.grid, limits=limits)
+    return replace(
+        query,
+        down_camera=encoded.down_camera,
+        camera_height=encoded.camera_height,
+        T_vehicle_camera=encoded.T_vehicle_camera,
+        neighbours=encoded.neighbours,
+        refine=encoded.refine,
+        prior=prior_in(encoded, bundle),
+        false_accept_rate=encoded.false_accept_rate or false_accept_rate,
+    )
 
 
 def prior_in(encoded: EncodedQuery, bundle: MapBundle) -> Prior | None:

@@ -14,6 +14,6 @@ def test_a_request_passes_few_files_before_the_engine_and_the_document_names_the
 ) -> None:
     parts = {name: (name, data, MEDIA_TYPES[name]) for name, data in parts_of().items()}
     before = trace_of_request(bundle_path, parts).before_engine
-    assert len(before) <= 8, "\n".join(before)
+    assert len(before) <= 7, "\n".join(before)
     told = (ROOT / "docs" / "architecture.md").read_text()
     assert [each for each in before if each.removeprefix("service/") not in told] == []
