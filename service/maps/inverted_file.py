@@ -1,0 +1,286 @@
+"""The index of a large map: an inverted file of short codes. It makes the shortlist without a scan of all views.
+
+FAISS groups the views by their nearest centroid, and a search reads only the groups near the query. A graph (HNSW) over the centroids
+finds these groups. The code of a view is its product-quantised difference from the centroid, and takes a byte for each four axes.
+Decision 0158 has the figures.
+"""
+
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import faiss
+import numpy as np
+from jaxtyping import Float32, Int8, Int64
+from numpy.typing import NDArray
+
+from service.errors import BundleError
+from service.maps import index
+from service.maps.index import Descriptors, vectors_of
+
+FILE = "search.faiss"
+#: Smallest number of views for this file. A scan of fewer views takes less than a tenth of a query's time (decision 0158).
+SMALLEST = 1_000_000
+#: Parameter of the manifest: recall@10 of the index against exact search, as measured when it was built.
+RECALL = "search_recall_at_10"
+#: Axes, and bytes of a code. A map with fewer components has fewer of both.
+_AXES, _CODE_BYTES = 96, 24
+#: Neighbours of a centroid in the graph.
+_LINKS = 32
+#: Steps of k-means, and views for each centroid that it takes into account.
+_STEPS, _VIEWS_PER_LIST = 6, 16
+#: Views for each of the 256 values of a code's byte.
+_VIEWS_PER_CODE = 128
+#: Smallest number of views that determine axes and codes.
+_SAMPLE = 65_536
+#: Views that are read at once.
+_CHUNK = 16_384
+#: Queries that measure recall, views that each of them lists, and best views of these that count.
+_QUERIES, _LISTED, _BEST = 256, 1_440, 10
+#: Noise of these queries: the share of a difference between two views of the map that is added to a view.
+_NOISE = 0.6
+#: Recall to reach. The number of lists that a search reads is doubled until then.
+_WANTED = 0.995
+_REMEDY = "copy or build the bundle again"
+
+
+def write_inverted_file(path: Path, numbers: Int8[NDArray[np.int8], "n D"]) -> float:
+    """Build the index of a map and write it; return its recall@10 against exact search.
+
+    The same descriptors give the same bytes on processors of one kind, for any number of threads.
+
+    Args:
+        path: the new file.
+        numbers: 8-bit descriptors, a row per view, as ``write_descriptors`` stores them.
+    """
+    with _threads(1):
+        whole = _trained(numbers)
+        _add(whole, numbers)
+        recall = _choose_probes(whole, numbers)
+        faiss.write_index(whole, str(path))
+    return recall
+
+
+def lists_for(views: int) -> int:
+    """Return the number of lists of an index: the power of two next to four times the root of the number of views.
+
+    Args:
+        views: number of views, 1 or more.
+    """
+    return int(2 ** max(0, round(np.log2(4 * np.sqrt(views)))))
+
+
+class InvertedFile:
+    """Open index of a large map. Several threads may search it at the same time.
+
+    Args:
+        whole: principal axes and inverted file.
+    """
+
+    def __init__(self, whole: faiss.IndexPreTransform) -> None:
+        self._whole = whole  # keeps the parts below alive
+        self._axes = faiss.downcast_VectorTransform(whole.chain.at(0))
+        self._lists = faiss.downcast_index(whole.index)
+        self._mean = np.array(faiss.vector_to_array(self._axes.mean), np.float32)
+
+    @classmethod
+    def open(cls, path: Path, *, views: int, dimension: int, verify: bool = True) -> "InvertedFile":
+        """Map the index into memory.
+
+        Args:
+            path: file that ``write_inverted_file`` wrote.
+            views: number of views of the map.
+            dimension: number of components of a descriptor.
+            verify: check that the lists hold every view once, and that the graph refers to its own centroids.
+
+        Raises:
+            BundleError: the file is damaged, or belongs to another map.
+        """
+        index.search_with_one_thread()
+        try:
+            whole = faiss.read_index(str(path), faiss.IO_FLAG_MMAP | faiss.IO_FLAG_READ_ONLY)
+        except RuntimeError as error:
+            reason = str(error).splitlines()[0].rpartition("Error: ")[2]
+            raise _defect(path, f"not a valid FAISS index ({reason})") from error
+        wrong = _unlike(whole, views, dimension, path.stat().st_size)
+        if not wrong and verify:
+            wrong = _inconsistent(faiss.downcast_index(whole.index))
+        if wrong:
+            raise _defect(path, wrong)
+        return cls(whole)
+
+    @property
+    def lists(self) -> int:
+        """Number of lists."""
+        return int(self._lists.nlist)
+
+    @property
+    def probes(self) -> int:
+        """Number of lists that a search reads at least."""
+        return int(self._lists.nprobe)
+
+    def shortlist(self, descriptor: Float32[NDArray[np.float32], " D"], k: int) -> Int64[NDArray[np.int64], " k"]:
+        """Return the indices of approximately the k most similar views, in no particular order.
+
+        The search reads more lists if these have fewer than k views. So it returns fewer than k views only if the graph does not lead
+        to all lists.
+
+        Args:
+            descriptor: descriptor of the query view.
+            k: length of the list, at most the number of views.
+        """
+        # The axes subtract the mean from views and queries. Only views may lose it (``index.ScannedCopy``).
+        asked, probes = self._axes.apply((descriptor + self._mean)[None]), self.probes
+        while True:
+            found: NDArray[np.int64] = self._lists.search(asked, k, params=faiss.SearchParametersIVF(nprobe=probes))[1][0]
+            found = found[found >= 0]
+            if len(found) == k or probes >= self.lists:
+                return found
+            probes *= 2
+
+
+@contextmanager
+def _threads(count: int) -> Iterator[None]:
+    """Make FAISS use some threads. With more than one, the graph and the rounding of sums depend on them, but no search does."""
+    before = faiss.omp_get_max_threads()
+    faiss.omp_set_num_threads(count)
+    try:
+        yield
+    finally:
+        faiss.omp_set_num_threads(before)
+
+
+def _trained(numbers: Int8[NDArray[np.int8], "n D"]) -> faiss.IndexPreTransform:
+    """Return an index with axes, centroids and codes, but without views."""
+    size, lists = numbers.shape[1], lists_for(len(numbers))
+    width = min(size, _AXES // _CODE_BYTES)
+    codes = min(_CODE_BYTES, size // width)
+    name = f"PCA{codes * width},IVF{lists}_HNSW{_LINKS},PQ{codes}np"  # np: no order of the codes for Hamming distances
+    whole = faiss.index_factory(size, name, faiss.METRIC_INNER_PRODUCT)
+    axes, inverted = faiss.downcast_VectorTransform(whole.chain.at(0)), faiss.downcast_index(whole.index)
+    axes.balanced_bins = codes  # every byte of a code gets the same share of the spectrum
+    inverted.cp.niter, inverted.cp.max_points_per_centroid, inverted.cp.min_points_per_centroid = _STEPS, _VIEWS_PER_LIST, 1
+    inverted.pq.cp.max_points_per_centroid, inverted.pq.cp.min_points_per_centroid = _VIEWS_PER_CODE, 1
+    # Comparing every view with every centroid would take an hour for 50 million views.
+    graph = faiss.IndexHNSWFlat(inverted.d, _LINKS, faiss.METRIC_INNER_PRODUCT)
+    inverted.clustering_index = graph
+    count = min(len(numbers), max(_SAMPLE, _VIEWS_PER_LIST * lists))
+    # Drawn at random, because views at equal distances may all have one heading.
+    rows = np.random.default_rng(0).choice(len(numbers), count, replace=False, shuffle=False)
+    whole.train(vectors_of(numbers[np.sort(rows)]))
+    inverted.clustering_index = None  # the graph ends with this function
+    return whole
+
+
+def _add(whole: faiss.IndexPreTransform, numbers: Int8[NDArray[np.int8], "n D"]) -> None:
+    """Add all views in their order. Lists and codes of a view do not depend on the number of threads."""
+    axes, inverted = faiss.downcast_VectorTransform(whole.chain.at(0)), faiss.downcast_index(whole.index)
+    for first in range(0, len(numbers), _CHUNK):
+        along = axes.apply(vectors_of(numbers[first : first + _CHUNK]))
+        with _threads(os.cpu_count() or 1):
+            inverted.add(along)
+    whole.ntotal = inverted.ntotal
+
+
+def _choose_probes(whole: faiss.IndexPreTransform, numbers: Int8[NDArray[np.int8], "n D"]) -> float:
+    """Set the smallest power of two as number of probes that reaches the recall wanted; return the recall.
+
+    Args:
+        whole: index of all views.
+        numbers: their descriptors.
+    """
+    asked = _queries(numbers)
+    tenth = _tenth_best(numbers, asked)
+    inverted, opened = faiss.downcast_index(whole.index), InvertedFile(whole)
+    inverted.nprobe = 1
+    while True:
+        recall = recall_of(opened, numbers, asked, tenth)
+        if recall >= _WANTED or inverted.nprobe >= inverted.nlist:
+            return recall
+        inverted.nprobe *= 2
+
+
+def recall_of(opened: InvertedFile, numbers: Int8[NDArray[np.int8], "n D"], asked: Descriptors, tenth: NDArray[np.float32]) -> float:
+    """Return the share of the ten most similar views that the shortlist has, mean over all queries.
+
+    Views as similar as the tenth count as much as the tenth.
+
+    Args:
+        opened: the index.
+        numbers: descriptors of all views.
+        asked: descriptors of the queries.
+        tenth: similarity of each query's tenth best view.
+    """
+    best, listed = min(_BEST, len(numbers)), min(_LISTED, len(numbers))
+    found = 0
+    for query, least in zip(asked, tenth, strict=True):
+        similarity = vectors_of(numbers[opened.shortlist(query, listed)]) @ query
+        found += min(best, int((similarity >= least - 1e-6).sum()))
+    return found / (best * len(asked))
+
+
+def _queries(numbers: Int8[NDArray[np.int8], "n D"]) -> Descriptors:
+    """Return views with the noise of two views of one place. Its spectrum is that of the map's own descriptors."""
+    rng = np.random.default_rng(0)
+    count = min(_QUERIES, len(numbers))
+    view, one, other = (vectors_of(numbers[np.sort(rng.integers(len(numbers), size=count))]) for _ in range(3))
+    noisy = view + _NOISE * (one - rng.permutation(other))
+    asked: Descriptors = noisy / np.maximum(np.linalg.norm(noisy, axis=1, keepdims=True), 1e-12)
+    return asked
+
+
+def _tenth_best(numbers: Int8[NDArray[np.int8], "n D"], asked: Descriptors) -> Float32[NDArray[np.float32], " q"]:
+    """Return the similarity of the tenth best view of each query by exact search, or of the last one of fewer views."""
+    kept = np.full((len(asked), min(_BEST, len(numbers))), -np.inf, np.float32)
+    for first in range(0, len(numbers), _CHUNK):
+        both = np.concatenate([kept, asked @ vectors_of(numbers[first : first + _CHUNK]).T], axis=1)
+        kept = -np.partition(-both, kept.shape[1] - 1, axis=1)[:, : kept.shape[1]]
+    return kept.min(axis=1)
+
+
+def _unlike(whole: Any, views: int, dimension: int, size: int) -> str:
+    """Return how an index differs from that of a map; empty if it fits."""
+    if not isinstance(whole, faiss.IndexPreTransform) or whole.chain.size() != 1:
+        return f"{type(whole).__name__} instead of principal axes with an inverted file"
+    axes, inverted = faiss.downcast_VectorTransform(whole.chain.at(0)), faiss.downcast_index(whole.index)
+    if not isinstance(axes, faiss.PCAMatrix) or not isinstance(inverted, faiss.IndexIVFPQ):
+        return f"{type(axes).__name__} and {type(inverted).__name__} instead of PCAMatrix and IndexIVFPQ"
+    graph, lists = faiss.downcast_index(inverted.quantizer), faiss.downcast_InvertedLists(inverted.invlists)
+    if not isinstance(graph, faiss.IndexHNSWFlat) or not isinstance(lists, faiss.OnDiskInvertedLists):
+        return f"{type(graph).__name__} and {type(lists).__name__} instead of IndexHNSWFlat and OnDiskInvertedLists"
+    if inverted.ntotal != views or lists.compute_ntotal() != views:
+        return f"{inverted.ntotal} views in its head and {lists.compute_ntotal()} in its lists instead of {views}"
+    if whole.d != dimension or axes.d_out != inverted.d or graph.d != inverted.d:
+        return f"descriptors of {whole.d} numbers instead of {dimension}, or parts that do not fit together"
+    if axes.mean.size() != dimension or graph.ntotal != inverted.nlist or not 1 <= inverted.nprobe <= inverted.nlist:
+        return f"{graph.ntotal} centroids and {inverted.nprobe} probes for {inverted.nlist} lists"
+    last = lists.lists.at(inverted.nlist - 1)
+    if inverted.code_size != inverted.pq.M or last.offset + last.size * (inverted.code_size + 8) > size:
+        return "the codes do not fit into the file"
+    return ""
+
+
+def _inconsistent(inverted: faiss.IndexIVFPQ) -> str:
+    """Return which reference of an index leads nowhere; empty if there is none."""
+    lists, seen = faiss.downcast_InvertedLists(inverted.invlists), np.zeros(inverted.ntotal, np.bool_)
+    for number in range(inverted.nlist):
+        count = lists.list_size(number)
+        if not count:
+            continue
+        views: NDArray[np.int64] = faiss.rev_swig_ptr(lists.get_ids(number), count)
+        if views.min() < 0 or views.max() >= len(seen):
+            return f"list {number} refers to a missing view"
+        seen[views] = True
+    if not seen.all():
+        return f"{int((~seen).sum())} views are in no list"
+    graph = faiss.downcast_index(inverted.quantizer).hnsw
+    neighbours = faiss.vector_to_array(graph.neighbors)
+    if len(neighbours) and not -1 <= neighbours.min() <= neighbours.max() < inverted.nlist:
+        return "the graph refers to a missing centroid"
+    return ""
+
+
+def _defect(path: Path, what: str) -> BundleError:
+    return BundleError(f"{path}: {what}; {_REMEDY}", field=FILE)
