@@ -27,7 +27,7 @@ from benchmarks.report import ROOT, Report
 
 #: The README comes first: it makes the dataset and the map that the other pages use.
 PAGES = ("README.md", "start", "survey", "recordings", "maps", "robot", "nav2", "python", "deploy", "serving", "console", "confidence",
-         "measuring", "train", "api", "problems", "formats", "how_it_works", "architecture", "paper", "limits", "faq", "index",
+         "measuring", "train", "api", "problems", "formats", "how_it_works", "architecture", "paper", "scale", "limits", "faq", "index",
          "contributing", "development", "decisions/index")  # fmt: skip
 KINDS = ("sh", "python", "json", "yaml", "text")
 _MARK = re.compile(r"<!-- (not run|file): (.+) -->")

@@ -1,6 +1,6 @@
 """``make bench-scale``: search in maps of up to a hundred towns -> reports/scale.json.
 
-The first run simulates three small cities and builds their maps, whose descriptors it keeps. A hundred towns need 5 GB of memory and
+The first run simulates two small cities and builds their maps, whose descriptors it keeps. A hundred towns need 5 GB of memory and
 2 GB of disk.
 """
 
@@ -44,9 +44,15 @@ def _similarity(queries: NDArray[np.float32], views: NDArray[np.float32]) -> flo
 def main() -> None:
     """Parse the arguments, measure and write the report."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--work", type=Path, default=ROOT / "data" / "scale", help="folder of datasets, maps and index files")
     parser.add_argument(
-        "--sizes", nargs="+", type=int, default=SIZES, help="numbers of views, 10,000 or more; the rows of other sizes stay"
+        "--work", type=Path, default=ROOT / "data" / "scale", help="folder of datasets, maps and index files"
+    )
+    parser.add_argument(
+        "--sizes",
+        nargs="+",
+        type=int,
+        default=SIZES,
+        help="numbers of views, 10,000 or more; the rows of other sizes stay",
     )
     arguments = parser.parse_args()
     if min(arguments.sizes) < 10_000:

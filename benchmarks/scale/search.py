@@ -71,7 +71,9 @@ def search_rows(report: Report, real: RealDescriptors, work: Path, sizes: tuple[
         began = time.perf_counter()
         recall = write_inverted_file(path, numbers)
         report.row(f"{name}.index_build_s", time.perf_counter() - began, "s", n=views)
-        report.row(f"{name}.index_recall_at_build", recall, "share", why="what `build-map` prints: views with noise as queries")
+        report.row(
+            f"{name}.index_recall_at_build", recall, "share", why="what `build-map` prints: views with noise as queries"
+        )
         report.row(f"{name}.index_bytes_per_view", path.stat().st_size / views, "B", n=views)
         began = time.perf_counter()
         opened = InvertedFile.open(path, views=views, dimension=numbers.shape[1])
@@ -94,9 +96,18 @@ def _bars(report: Report, town: Found | None, town_indexed: Found | None, towns:
         report.absent("search.ms_at_100_times_the_town", "ratio", why)
         return
     why = f"{towns.ms:.2f} ms against {town.ms:.2f} ms; the town is below the size of the index file, so it is scanned"
-    report.row("search.ms_at_100_times_the_town", towns.ms / town.ms, "ratio", bar=2, better="lower", n=QUERIES, why=why)
+    report.row(
+        "search.ms_at_100_times_the_town", towns.ms / town.ms, "ratio", bar=2, better="lower", n=QUERIES, why=why
+    )
     why = f"{town_indexed.ms:.2f} ms for an index file of the town, which `build-map` does not write"
-    report.row("search.ms_at_100_times_the_indexed_town", towns.ms / town_indexed.ms, "ratio", better="lower", n=QUERIES, why=why)
+    report.row(
+        "search.ms_at_100_times_the_indexed_town",
+        towns.ms / town_indexed.ms,
+        "ratio",
+        better="lower",
+        n=QUERIES,
+        why=why,
+    )
 
 
 def _rows(

@@ -18,7 +18,7 @@ from service.localization.localizer import Localizer
 from service.maps.reader import MapBundle
 
 #: Number of cities, their extent (m), and the query positions of each. Each position has a query with each depth camera.
-CITIES, CITY_M, POSITIONS = 3, (200.0, 200.0), 50
+CITIES, CITY_M, POSITIONS = 2, (200.0, 200.0), 50
 #: Map views of a place.
 HEADINGS = 24
 
@@ -63,9 +63,7 @@ def city_plan(index: int) -> SimulationPlan:
         index: number of the city, from 0.
     """
     queries = (QueryPlan(name="drive1", traversal=1, count=POSITIONS, depths=BOTH),)
-    return SimulationPlan(
-        name=f"scale-{index + 1}", seed=EVALUATION_SEEDS[40 + index], size_m=CITY_M, queries=queries
-    )
+    return SimulationPlan(name=f"scale-{index + 1}", seed=EVALUATION_SEEDS[40 + index], size_m=CITY_M, queries=queries)
 
 
 def real_descriptors(runs: Runs) -> RealDescriptors:

@@ -6,7 +6,7 @@ A large map has an index file instead of the copy (``inverted_file``).
 """
 
 from pathlib import Path
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import faiss
 import numpy as np
@@ -94,6 +94,7 @@ def vectors_of(numbers: Int8[NDArray[np.int8], "n D"]) -> Descriptors:
     return vectors
 
 
+@runtime_checkable
 class Shortlister(Protocol):
     """Finds views that may be similar to a query, much faster than an exact comparison with all of them."""
 
@@ -122,7 +123,9 @@ class ScannedCopy:
             self._copy.add(vectors_of(numbers))
             return
         axes = faiss.PCAMatrix(size, min(_AXES, size))
-        codes = faiss.IndexScalarQuantizer(axes.d_out, faiss.ScalarQuantizer.QT_8bit_uniform, faiss.METRIC_INNER_PRODUCT)
+        codes = faiss.IndexScalarQuantizer(
+            axes.d_out, faiss.ScalarQuantizer.QT_8bit_uniform, faiss.METRIC_INNER_PRODUCT
+        )
         self._copy = faiss.IndexPreTransform(axes, codes)
         self._copy.train(vectors_of(numbers[:: -(-len(numbers) // _SAMPLE)]))
         for first in range(0, len(numbers), _CHUNK):

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from service.errors import BundleError
 from service.maps import index
-from service.maps.index import Descriptors, vectors_of
+from service.maps.index import Descriptors, Shortlister, vectors_of
 
 FILE = "search.faiss"
 #: Smallest number of views for this file. A scan of fewer views takes less than a tenth of a query's time (decision 0158).
@@ -134,7 +134,9 @@ class InvertedFile:
         # The axes subtract the mean from views and queries. Only views may lose it (``index.ScannedCopy``).
         asked, probes = self._axes.apply((descriptor + self._mean)[None]), self.probes
         while True:
-            found: NDArray[np.int64] = self._lists.search(asked, k, params=faiss.SearchParametersIVF(nprobe=probes))[1][0]
+            found: NDArray[np.int64] = self._lists.search(asked, k, params=faiss.SearchParametersIVF(nprobe=probes))[1][
+                0
+            ]
             found = found[found >= 0]
             if len(found) == k or probes >= self.lists:
                 return found
@@ -161,7 +163,11 @@ def _trained(numbers: Int8[NDArray[np.int8], "n D"]) -> faiss.IndexPreTransform:
     whole = faiss.index_factory(size, name, faiss.METRIC_INNER_PRODUCT)
     axes, inverted = faiss.downcast_VectorTransform(whole.chain.at(0)), faiss.downcast_index(whole.index)
     axes.balanced_bins = codes  # every byte of a code gets the same share of the spectrum
-    inverted.cp.niter, inverted.cp.max_points_per_centroid, inverted.cp.min_points_per_centroid = _STEPS, _VIEWS_PER_LIST, 1
+    inverted.cp.niter, inverted.cp.max_points_per_centroid, inverted.cp.min_points_per_centroid = (
+        _STEPS,
+        _VIEWS_PER_LIST,
+        1,
+    )
     inverted.pq.cp.max_points_per_centroid, inverted.pq.cp.min_points_per_centroid = _VIEWS_PER_CODE, 1
     # Comparing every view with every centroid would take an hour for 50 million views.
     graph = faiss.IndexHNSWFlat(inverted.d, _LINKS, faiss.METRIC_INNER_PRODUCT)
@@ -202,7 +208,9 @@ def _choose_probes(whole: faiss.IndexPreTransform, numbers: Int8[NDArray[np.int8
         inverted.nprobe *= 2
 
 
-def recall_of(opened: InvertedFile, numbers: Int8[NDArray[np.int8], "n D"], asked: Descriptors, tenth: NDArray[np.float32]) -> float:
+def recall_of(
+    opened: Shortlister, numbers: Int8[NDArray[np.int8], "n D"], asked: Descriptors, tenth: NDArray[np.float32]
+) -> float:
     """Return the share of the ten most similar views that the shortlist has, mean over all queries.
 
     Views as similar as the tenth count as much as the tenth.

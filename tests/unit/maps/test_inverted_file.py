@@ -63,7 +63,9 @@ def large(content_of: Callable[..., BundleContent]) -> BundleContent:
 
 
 # 4 sqrt(100) = 40 lies nearer to 32 than to 64 on a logarithmic scale; 4 sqrt(489,000) = 2797; 4 sqrt(48.9 million) = 27,971.
-@pytest.mark.parametrize(("views", "lists"), [(1, 4), (16, 16), (100, 32), (489_000, 2048), (1_000_000, 4096), (48_900_000, 32_768)])
+@pytest.mark.parametrize(
+    ("views", "lists"), [(1, 4), (16, 16), (100, 32), (489_000, 2048), (1_000_000, 4096), (48_900_000, 32_768)]
+)
 def test_the_number_of_lists_follows_the_root_of_the_number_of_views(views: int, lists: int) -> None:
     assert lists_for(views) == lists
 
@@ -101,10 +103,12 @@ def test_recall_counts_the_ten_best_views_that_are_listed(opened: InvertedFile, 
     given_lists = iter(lists.values())
     fake = SimpleNamespace(shortlist=lambda _query, _k: next(given_lists))
     tenth = np.sort(-(asked @ stored.T), axis=1)[:, 9] * -1
-    assert inverted_file.recall_of(fake, written.numbers, asked, tenth) == pytest.approx(0.85)  # type: ignore[arg-type]
+    assert inverted_file.recall_of(fake, written.numbers, asked, tenth) == pytest.approx(0.85)
 
 
-def test_the_tenth_best_view_is_found_over_all_chunks(written: SimpleNamespace, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_tenth_best_view_is_found_over_all_chunks(
+    written: SimpleNamespace, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(inverted_file, "_CHUNK", 64)
     asked = unit_vectors(4, SIZE, seed=3)
     expected = np.sort(asked @ vectors_of(written.numbers).T, axis=1)[:, -10]
@@ -144,9 +148,14 @@ def test_a_truncated_file_is_refused(written: SimpleNamespace, tmp_path: Path, k
 
 @pytest.mark.parametrize(
     ("views", "dimension", "message"),
-    [(VIEWS - 1, SIZE, "3000 views in its head and 3000 in its lists instead of 2999"), (VIEWS, 8, "descriptors of 16 numbers instead of 8")],
+    [
+        (VIEWS - 1, SIZE, "3000 views in its head and 3000 in its lists instead of 2999"),
+        (VIEWS, 8, "descriptors of 16 numbers instead of 8"),
+    ],
 )
-def test_the_index_of_another_map_is_refused(written: SimpleNamespace, views: int, dimension: int, message: str) -> None:
+def test_the_index_of_another_map_is_refused(
+    written: SimpleNamespace, views: int, dimension: int, message: str
+) -> None:
     with pytest.raises(BundleError, match=message):
         InvertedFile.open(written.path, views=views, dimension=dimension)
 
@@ -162,7 +171,10 @@ def test_another_kind_of_index_is_refused(tmp_path: Path) -> None:
         InvertedFile.open(tmp_path / FILE, views=0, dimension=SIZE)
 
 
-@pytest.mark.parametrize(("number", "message"), [(VIEWS, "refers to a missing view"), (-1, "refers to a missing view"), (None, "1 views are in no list")])
+@pytest.mark.parametrize(
+    ("number", "message"),
+    [(VIEWS, "refers to a missing view"), (-1, "refers to a missing view"), (None, "1 views are in no list")],
+)
 def test_lists_with_wrong_views_are_refused(
     written: SimpleNamespace, tmp_path: Path, number: int | None, message: str
 ) -> None:
@@ -180,7 +192,9 @@ def test_lists_with_wrong_views_are_refused(
     InvertedFile.open(tmp_path / FILE, views=VIEWS, dimension=SIZE, verify=False)
 
 
-def test_a_map_below_the_size_has_no_index(large: BundleContent, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_map_below_the_size_has_no_index(
+    large: BundleContent, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(inverted_file, "SMALLEST", 4 * PLACES + 1)
     made = write_bundle(tmp_path / "m", large)
     assert FILE not in made.files
@@ -201,7 +215,9 @@ def test_a_map_above_the_size_is_searched_through_its_index(indexed: Path) -> No
     bundle = MapBundle.open(indexed)
     assert FILE in bundle.manifest.files
     assert isinstance(bundle.view_index._shortlister, InvertedFile)
-    assert f"search index with recall@10 of {bundle.manifest.parameters[RECALL]:.3f} against exact search" in describe(bundle.manifest)
+    assert f"search index with recall@10 of {bundle.manifest.parameters[RECALL]:.3f} against exact search" in describe(
+        bundle.manifest
+    )
     exact = bundle.view_index.vectors(np.arange(400))
     for view in (0, 77, 399):
         found = search_views(bundle, exact[view : view + 1], turns_rad=(0.0,), places=5, fewest=20)
@@ -228,7 +244,9 @@ def test_a_damaged_index_is_refused_with_its_name(indexed: Path) -> None:
     data = bytearray((indexed / FILE).read_bytes())
     data[len(data) // 2] ^= 1
     (indexed / FILE).write_bytes(data)
-    with pytest.raises(BundleError, match=rf"{FILE}: the hash does not match the manifest; copy or build the bundle again"):
+    with pytest.raises(
+        BundleError, match=rf"{FILE}: the hash does not match the manifest; copy or build the bundle again"
+    ):
         MapBundle.open(indexed)
 
 
@@ -242,7 +260,10 @@ def test_a_smaller_map_forgets_the_recall_of_a_larger_one(indexed: Path, monkeyp
 def test_merging_measures_the_recall_again(indexed: Path, large: BundleContent) -> None:
     moved = large.T_map_place.copy()
     moved[:, 1, 3] += 500
-    write_bundle(indexed.parent / "other", dataclasses.replace(large, T_map_place=moved, descriptors=unit_vectors(400, SIZE, seed=9)))
+    write_bundle(
+        indexed.parent / "other",
+        dataclasses.replace(large, T_map_place=moved, descriptors=unit_vectors(400, SIZE, seed=9)),
+    )
     made = merge_maps(indexed, indexed.parent / "other", indexed.parent / "both")
     assert made.counts.views == 800
     assert 0.9 <= made.parameters[RECALL] <= 1
