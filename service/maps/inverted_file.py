@@ -9,16 +9,16 @@ import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol, runtime_checkable
 
 import faiss
 import numpy as np
-from jaxtyping import Float32, Int8, Int64
+from jaxtyping import Float32, Int64
 from numpy.typing import NDArray
 
 from service.errors import BundleError
 from service.maps import index
-from service.maps.index import Descriptors, Shortlister, vectors_of
+from service.maps.index import Shortlister, vectors_of
 
 FILE = "search.faiss"
 #: Smallest number of views for this file. A scan of fewer views takes less than a tenth of a query's time (decision 0158).
@@ -29,6 +29,8 @@ RECALL = "search_recall_at_10"
 _AXES, _CODE_BYTES = 96, 24
 #: Neighbours of a centroid in the graph.
 _LINKS = 32
+#: Fewest candidates of a search in the graph. More find nearer centroids and take longer.
+_LEAST_CANDIDATES = 64
 #: Steps of k-means, and views for each centroid that it takes into account.
 _STEPS, _VIEWS_PER_LIST = 6, 16
 #: Views for each of the 256 values of a code's byte.
@@ -44,9 +46,29 @@ _NOISE = 0.6
 #: Recall to reach. The number of lists that a search reads is doubled until then.
 _WANTED = 0.995
 _REMEDY = "copy or build the bundle again"
+_Asked = Float32[NDArray[np.float32], "q D"]
 
 
-def write_inverted_file(path: Path, numbers: Int8[NDArray[np.int8], "n D"]) -> float:
+@runtime_checkable
+class Rows(Protocol):
+    """The 8-bit descriptors of all views, a row per view: an array, or something that computes the rows that are read."""
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """Number of views, and number of components."""
+
+    def __len__(self) -> int:
+        """Return the number of views."""
+
+    def __getitem__(self, views: Any, /) -> NDArray[np.int8]:
+        """Return the rows of some views.
+
+        Args:
+            views: a slice, or the numbers of the views.
+        """
+
+
+def write_inverted_file(path: Path, numbers: Rows) -> float:
     """Build the index of a map and write it; return its recall@10 against exact search.
 
     The same descriptors give the same bytes on processors of one kind, for any number of threads.
@@ -83,7 +105,6 @@ class InvertedFile:
         self._whole = whole  # keeps the parts below alive
         self._axes = faiss.downcast_VectorTransform(whole.chain.at(0))
         self._lists = faiss.downcast_index(whole.index)
-        self._mean = np.array(faiss.vector_to_array(self._axes.mean), np.float32)
 
     @classmethod
     def open(cls, path: Path, *, views: int, dimension: int, verify: bool = True) -> "InvertedFile":
@@ -131,12 +152,12 @@ class InvertedFile:
             descriptor: descriptor of the query view.
             k: length of the list, at most the number of views.
         """
-        # The axes subtract the mean from views and queries. Only views may lose it (``index.ScannedCopy``).
-        asked, probes = self._axes.apply((descriptor + self._mean)[None]), self.probes
+        asked, probes = self._axes.apply(descriptor[None]), self.probes
         while True:
-            found: NDArray[np.int64] = self._lists.search(asked, k, params=faiss.SearchParametersIVF(nprobe=probes))[1][
-                0
-            ]
+            # The graph lists the nearest centroids well only if it keeps as many candidates as it shall return.
+            graph = faiss.SearchParametersHNSW(efSearch=max(probes, _LEAST_CANDIDATES))
+            reading = faiss.SearchParametersIVF(nprobe=probes, quantizer_params=graph)
+            found: NDArray[np.int64] = self._lists.search(asked, k, params=reading)[1][0]
             found = found[found >= 0]
             if len(found) == k or probes >= self.lists:
                 return found
@@ -154,7 +175,7 @@ def _threads(count: int) -> Iterator[None]:
         faiss.omp_set_num_threads(before)
 
 
-def _trained(numbers: Int8[NDArray[np.int8], "n D"]) -> faiss.IndexPreTransform:
+def _trained(numbers: Rows) -> faiss.IndexPreTransform:
     """Return an index with axes, centroids and codes, but without views."""
     size, lists = numbers.shape[1], lists_for(len(numbers))
     width = min(size, _AXES // _CODE_BYTES)
@@ -174,13 +195,18 @@ def _trained(numbers: Int8[NDArray[np.int8], "n D"]) -> faiss.IndexPreTransform:
     inverted.clustering_index = graph
     count = min(len(numbers), max(_SAMPLE, _VIEWS_PER_LIST * lists))
     # Drawn at random, because views at equal distances may all have one heading.
-    rows = np.random.default_rng(0).choice(len(numbers), count, replace=False, shuffle=False)
-    whole.train(vectors_of(numbers[np.sort(rows)]))
+    rows = np.random.default_rng(0).choice(len(numbers), count, replace=False)
+    sample = vectors_of(numbers[np.sort(rows)])
+    # With their opposites the views have a mean of zero. So the axes keep the length of a view, and spherical centroids fit.
+    some = sample[:: -(-len(sample) // _SAMPLE)]
+    axes.train(np.concatenate([some, -some]))
+    inverted.train(axes.apply(sample))
     inverted.clustering_index = None  # the graph ends with this function
+    whole.is_trained = True
     return whole
 
 
-def _add(whole: faiss.IndexPreTransform, numbers: Int8[NDArray[np.int8], "n D"]) -> None:
+def _add(whole: faiss.IndexPreTransform, numbers: Rows) -> None:
     """Add all views in their order. Lists and codes of a view do not depend on the number of threads."""
     axes, inverted = faiss.downcast_VectorTransform(whole.chain.at(0)), faiss.downcast_index(whole.index)
     for first in range(0, len(numbers), _CHUNK):
@@ -190,7 +216,7 @@ def _add(whole: faiss.IndexPreTransform, numbers: Int8[NDArray[np.int8], "n D"])
     whole.ntotal = inverted.ntotal
 
 
-def _choose_probes(whole: faiss.IndexPreTransform, numbers: Int8[NDArray[np.int8], "n D"]) -> float:
+def _choose_probes(whole: faiss.IndexPreTransform, numbers: Rows) -> float:
     """Set the smallest power of two as number of probes that reaches the recall wanted; return the recall.
 
     Args:
@@ -208,9 +234,7 @@ def _choose_probes(whole: faiss.IndexPreTransform, numbers: Int8[NDArray[np.int8
         inverted.nprobe *= 2
 
 
-def recall_of(
-    opened: Shortlister, numbers: Int8[NDArray[np.int8], "n D"], asked: Descriptors, tenth: NDArray[np.float32]
-) -> float:
+def recall_of(opened: Shortlister, numbers: Rows, asked: _Asked, tenth: NDArray[np.float32]) -> float:
     """Return the share of the ten most similar views that the shortlist has, mean over all queries.
 
     Views as similar as the tenth count as much as the tenth.
@@ -229,17 +253,17 @@ def recall_of(
     return found / (best * len(asked))
 
 
-def _queries(numbers: Int8[NDArray[np.int8], "n D"]) -> Descriptors:
+def _queries(numbers: Rows) -> _Asked:
     """Return views with the noise of two views of one place. Its spectrum is that of the map's own descriptors."""
     rng = np.random.default_rng(0)
     count = min(_QUERIES, len(numbers))
     view, one, other = (vectors_of(numbers[np.sort(rng.integers(len(numbers), size=count))]) for _ in range(3))
     noisy = view + _NOISE * (one - rng.permutation(other))
-    asked: Descriptors = noisy / np.maximum(np.linalg.norm(noisy, axis=1, keepdims=True), 1e-12)
+    asked: _Asked = noisy / np.maximum(np.linalg.norm(noisy, axis=1, keepdims=True), 1e-12)
     return asked
 
 
-def _tenth_best(numbers: Int8[NDArray[np.int8], "n D"], asked: Descriptors) -> Float32[NDArray[np.float32], " q"]:
+def _tenth_best(numbers: Rows, asked: _Asked) -> Float32[NDArray[np.float32], " q"]:
     """Return the similarity of the tenth best view of each query by exact search, or of the last one of fewer views."""
     kept = np.full((len(asked), min(_BEST, len(numbers))), -np.inf, np.float32)
     for first in range(0, len(numbers), _CHUNK):
@@ -262,7 +286,7 @@ def _unlike(whole: Any, views: int, dimension: int, size: int) -> str:
         return f"{inverted.ntotal} views in its head and {lists.compute_ntotal()} in its lists instead of {views}"
     if whole.d != dimension or axes.d_out != inverted.d or graph.d != inverted.d:
         return f"descriptors of {whole.d} numbers instead of {dimension}, or parts that do not fit together"
-    if axes.mean.size() != dimension or graph.ntotal != inverted.nlist or not 1 <= inverted.nprobe <= inverted.nlist:
+    if graph.ntotal != inverted.nlist or not 1 <= inverted.nprobe <= inverted.nlist:
         return f"{graph.ntotal} centroids and {inverted.nprobe} probes for {inverted.nlist} lists"
     last = lists.lists.at(inverted.nlist - 1)
     if inverted.code_size != inverted.pq.M or last.offset + last.size * (inverted.code_size + 8) > size:
