@@ -21,7 +21,7 @@ TOWN, TOWNS = 489_000, 100 * 489_000
 #: Sizes of the drawn maps, and the largest that is also scanned. A larger scan is as much slower as the map is larger.
 SIZES, MOST_SCANNED = (100_000, TOWN, 1_000_000, 3_000_000, 10_000_000, TOWNS), 3_000_000
 #: Queries, and views that an answer takes from a search by default.
-QUERIES, WANTED = 150, 240
+QUERIES, WANTED = 100, 240
 #: Best views that count for recall.
 BEST = 10
 #: Descriptors in memory that the exact comparison reads. The 12.5 GB of a hundred towns do not fit, so theirs are read at other places.

@@ -1,8 +1,7 @@
 """The index of a large map: an inverted file of short codes. It makes the shortlist without a scan of all views.
 
 FAISS groups the views by their nearest centroid, and a search reads only the groups near the query. A graph (HNSW) over the centroids
-finds these groups. The code of a view is its product-quantised difference from the centroid, and takes a byte for each four axes.
-Decision 0158 has the figures.
+finds these groups. The code of a view is its difference from the centroid, and takes four bits per axis. Decision 0158 has the figures.
 """
 
 import os
@@ -25,26 +24,26 @@ FILE = "search.faiss"
 SMALLEST = 1_000_000
 #: Parameter of the manifest: recall@10 of the index against exact search, as measured when it was built.
 RECALL = "search_recall_at_10"
-#: Axes, and bytes of a code. A map with fewer components has fewer of both.
-_AXES, _CODE_BYTES = 96, 24
+#: Number of principal axes. A map with fewer components has fewer.
+_AXES = 48
+#: Share of the views on either side that the range of a code leaves out. Rare values would make its steps too large.
+_OUTLIERS = 0.005
 #: Neighbours of a centroid in the graph.
 _LINKS = 32
 #: Fewest candidates of a search in the graph. More find nearer centroids and take longer.
 _LEAST_CANDIDATES = 64
 #: Steps of k-means, and views for each centroid that it takes into account.
 _STEPS, _VIEWS_PER_LIST = 6, 16
-#: Views for each of the 256 values of a code's byte.
-_VIEWS_PER_CODE = 128
-#: Smallest number of views that determine axes and codes.
+#: Smallest number of views that determine axes and ranges.
 _SAMPLE = 65_536
 #: Views that are read at once.
 _CHUNK = 16_384
 #: Queries that measure recall, views that each of them lists, and best views of these that count.
-_QUERIES, _LISTED, _BEST = 256, 1_440, 10
+_QUERIES, _LISTED, _BEST = 128, 1_440, 10
 #: Noise of these queries: the share of a difference between two views of the map that is added to a view.
 _NOISE = 0.6
-#: Recall to reach. The number of lists that a search reads is doubled until then.
-_WANTED = 0.995
+#: Recall to reach, and factor by which the number of lists that a search reads grows until then.
+_WANTED, _GROWTH = 0.992, 2**0.5
 _REMEDY = "copy or build the bundle again"
 _Asked = Float32[NDArray[np.float32], "q D"]
 
@@ -86,12 +85,12 @@ def write_inverted_file(path: Path, numbers: Rows) -> float:
 
 
 def lists_for(views: int) -> int:
-    """Return the number of lists of an index: the power of two next to four times the root of the number of views.
+    """Return the number of lists of an index: the power of two next to eight times the root of the number of views.
 
     Args:
         views: number of views, 1 or more.
     """
-    return int(2 ** max(0, round(np.log2(4 * np.sqrt(views)))))
+    return int(2 ** max(0, round(np.log2(8 * np.sqrt(views)))))
 
 
 class InvertedFile:
@@ -130,6 +129,8 @@ class InvertedFile:
             wrong = _inconsistent(faiss.downcast_index(whole.index))
         if wrong:
             raise _defect(path, wrong)
+        # FAISS would start 32 threads for each search, which read the lists in advance (2 ms).
+        faiss.downcast_InvertedLists(faiss.downcast_index(whole.index).invlists).prefetch_nthread = 0
         return cls(whole)
 
     @property
@@ -178,18 +179,12 @@ def _threads(count: int) -> Iterator[None]:
 def _trained(numbers: Rows) -> faiss.IndexPreTransform:
     """Return an index with axes, centroids and codes, but without views."""
     size, lists = numbers.shape[1], lists_for(len(numbers))
-    width = min(size, _AXES // _CODE_BYTES)
-    codes = min(_CODE_BYTES, size // width)
-    name = f"PCA{codes * width},IVF{lists}_HNSW{_LINKS},PQ{codes}np"  # np: no order of the codes for Hamming distances
+    name = f"PCA{min(_AXES, size)},IVF{lists}_HNSW{_LINKS},SQ4"
     whole = faiss.index_factory(size, name, faiss.METRIC_INNER_PRODUCT)
     axes, inverted = faiss.downcast_VectorTransform(whole.chain.at(0)), faiss.downcast_index(whole.index)
-    axes.balanced_bins = codes  # every byte of a code gets the same share of the spectrum
-    inverted.cp.niter, inverted.cp.max_points_per_centroid, inverted.cp.min_points_per_centroid = (
-        _STEPS,
-        _VIEWS_PER_LIST,
-        1,
-    )
-    inverted.pq.cp.max_points_per_centroid, inverted.pq.cp.min_points_per_centroid = _VIEWS_PER_CODE, 1
+    settings = inverted.cp
+    settings.niter, settings.max_points_per_centroid, settings.min_points_per_centroid = _STEPS, _VIEWS_PER_LIST, 1
+    inverted.sq.rangestat, inverted.sq.rangestat_arg = faiss.ScalarQuantizer.RS_quantiles, _OUTLIERS
     # Comparing every view with every centroid would take an hour for 50 million views.
     graph = faiss.IndexHNSWFlat(inverted.d, _LINKS, faiss.METRIC_INNER_PRODUCT)
     inverted.clustering_index = graph
@@ -217,7 +212,7 @@ def _add(whole: faiss.IndexPreTransform, numbers: Rows) -> None:
 
 
 def _choose_probes(whole: faiss.IndexPreTransform, numbers: Rows) -> float:
-    """Set the smallest power of two as number of probes that reaches the recall wanted; return the recall.
+    """Set about the smallest number of probes that reaches the recall wanted; return the recall.
 
     Args:
         whole: index of all views.
@@ -226,12 +221,13 @@ def _choose_probes(whole: faiss.IndexPreTransform, numbers: Rows) -> float:
     asked = _queries(numbers)
     tenth = _tenth_best(numbers, asked)
     inverted, opened = faiss.downcast_index(whole.index), InvertedFile(whole)
-    inverted.nprobe = 1
+    probes = 1.0
     while True:
+        inverted.nprobe = min(round(probes), inverted.nlist)
         recall = recall_of(opened, numbers, asked, tenth)
-        if recall >= _WANTED or inverted.nprobe >= inverted.nlist:
+        if recall >= _WANTED or inverted.nprobe == inverted.nlist:
             return recall
-        inverted.nprobe *= 2
+        probes *= _GROWTH
 
 
 def recall_of(opened: Shortlister, numbers: Rows, asked: _Asked, tenth: NDArray[np.float32]) -> float:
@@ -277,8 +273,8 @@ def _unlike(whole: Any, views: int, dimension: int, size: int) -> str:
     if not isinstance(whole, faiss.IndexPreTransform) or whole.chain.size() != 1:
         return f"{type(whole).__name__} instead of principal axes with an inverted file"
     axes, inverted = faiss.downcast_VectorTransform(whole.chain.at(0)), faiss.downcast_index(whole.index)
-    if not isinstance(axes, faiss.PCAMatrix) or not isinstance(inverted, faiss.IndexIVFPQ):
-        return f"{type(axes).__name__} and {type(inverted).__name__} instead of PCAMatrix and IndexIVFPQ"
+    if not isinstance(axes, faiss.PCAMatrix) or not isinstance(inverted, faiss.IndexIVFScalarQuantizer):
+        return f"{type(axes).__name__} and {type(inverted).__name__} instead of PCAMatrix and IndexIVFScalarQuantizer"
     graph, lists = faiss.downcast_index(inverted.quantizer), faiss.downcast_InvertedLists(inverted.invlists)
     if not isinstance(graph, faiss.IndexHNSWFlat) or not isinstance(lists, faiss.OnDiskInvertedLists):
         return f"{type(graph).__name__} and {type(lists).__name__} instead of IndexHNSWFlat and OnDiskInvertedLists"
@@ -289,12 +285,16 @@ def _unlike(whole: Any, views: int, dimension: int, size: int) -> str:
     if graph.ntotal != inverted.nlist or not 1 <= inverted.nprobe <= inverted.nlist:
         return f"{graph.ntotal} centroids and {inverted.nprobe} probes for {inverted.nlist} lists"
     last = lists.lists.at(inverted.nlist - 1)
-    if inverted.code_size != inverted.pq.M or last.offset + last.size * (inverted.code_size + 8) > size:
+    if (
+        inverted.sq.qtype != faiss.ScalarQuantizer.QT_4bit
+        or inverted.code_size != (inverted.d + 1) // 2
+        or last.offset + last.size * (inverted.code_size + 8) > size
+    ):
         return "the codes do not fit into the file"
     return ""
 
 
-def _inconsistent(inverted: faiss.IndexIVFPQ) -> str:
+def _inconsistent(inverted: faiss.IndexIVFScalarQuantizer) -> str:
     """Return which reference of an index leads nowhere; empty if there is none."""
     lists, seen = faiss.downcast_InvertedLists(inverted.invlists), np.zeros(inverted.ntotal, np.bool_)
     for number in range(inverted.nlist):
