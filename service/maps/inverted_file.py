@@ -1,7 +1,8 @@
 """The index of a large map: an inverted file of short codes. It makes the shortlist without a scan of all views.
 
 FAISS groups the views by their nearest centroid, and a search reads only the groups near the query. A graph (HNSW) over the centroids
-finds these groups. The code of a view is its difference from the centroid, and takes four bits per axis. Decision 0158 has the figures.
+finds these groups. The code of a view is its difference from the centroid, and takes four bits per axis. The neighbours of the best views
+along the survey complete the shortlist. Decision 0158 has the figures.
 """
 
 import os
@@ -32,6 +33,9 @@ _OUTLIERS = 0.005
 _LINKS = 32
 #: Fewest candidates of a search in the graph. More find nearer centroids and take longer.
 _LEAST_CANDIDATES = 64
+#: Of a list of k views, a half comes from the codes. The best sixth brings its neighbours: views of so many places before and after it,
+#: at headings so far away.
+_FROM_CODES, _BRING, _PLACES, _TURNS = 2, 6, 2, 1
 #: Steps of k-means, and views for each centroid that it takes into account.
 _STEPS, _VIEWS_PER_LIST = 6, 16
 #: Smallest number of views that determine axes and ranges.
@@ -67,19 +71,20 @@ class Rows(Protocol):
         """
 
 
-def write_inverted_file(path: Path, numbers: Rows) -> float:
+def write_inverted_file(path: Path, numbers: Rows, *, headings: int) -> float:
     """Build the index of a map and write it; return its recall@10 against exact search.
 
     The same descriptors give the same bytes on processors of one kind, for any number of threads.
 
     Args:
         path: the new file.
-        numbers: 8-bit descriptors, a row per view, as ``write_descriptors`` stores them.
+        numbers: 8-bit descriptors, a row per view, as ``write_descriptors`` stores them. Places follow each other as in the survey.
+        headings: number of views per place.
     """
     with _threads(1):
         whole = _trained(numbers)
         _add(whole, numbers)
-        recall = _choose_probes(whole, numbers)
+        recall = _choose_probes(whole, numbers, headings)
         faiss.write_index(whole, str(path))
     return recall
 
@@ -98,21 +103,24 @@ class InvertedFile:
 
     Args:
         whole: principal axes and inverted file.
+        headings: number of views per place.
     """
 
-    def __init__(self, whole: faiss.IndexPreTransform) -> None:
+    def __init__(self, whole: faiss.IndexPreTransform, headings: int) -> None:
+        self._headings = headings
         self._whole = whole  # keeps the parts below alive
         self._axes = faiss.downcast_VectorTransform(whole.chain.at(0))
         self._lists = faiss.downcast_index(whole.index)
 
     @classmethod
-    def open(cls, path: Path, *, views: int, dimension: int, verify: bool = True) -> "InvertedFile":
+    def open(cls, path: Path, *, views: int, dimension: int, headings: int, verify: bool = True) -> "InvertedFile":
         """Map the index into memory.
 
         Args:
             path: file that ``write_inverted_file`` wrote.
             views: number of views of the map.
             dimension: number of components of a descriptor.
+            headings: number of views per place.
             verify: check that the lists hold every view once, and that the graph refers to its own centroids.
 
         Raises:
@@ -131,7 +139,7 @@ class InvertedFile:
             raise _defect(path, wrong)
         # FAISS would start 32 threads for each search, which read the lists in advance (2 ms).
         faiss.downcast_InvertedLists(faiss.downcast_index(whole.index).invlists).prefetch_nthread = 0
-        return cls(whole)
+        return cls(whole, headings)
 
     @property
     def lists(self) -> int:
@@ -143,26 +151,36 @@ class InvertedFile:
         """Number of lists that a search reads at least."""
         return int(self._lists.nprobe)
 
-    def shortlist(self, descriptor: Float32[NDArray[np.float32], " D"], k: int) -> Int64[NDArray[np.int64], " k"]:
-        """Return the indices of approximately the k most similar views, in no particular order.
-
-        The search reads more lists if these have fewer than k views. So it returns fewer than k views only if the graph does not lead
-        to all lists.
+    def shortlist(self, descriptor: Float32[NDArray[np.float32], " D"], k: int) -> Int64[NDArray[np.int64], " n"]:
+        """Return the indices of about the k most similar views, ascending. There may be a few times more or fewer than k.
 
         Args:
             descriptor: descriptor of the query view.
             k: length of the list, at most the number of views.
         """
+        found = self._by_codes(descriptor, -(-k // _FROM_CODES))
+        return np.union1d(found, self._neighbours(found[: -(-k // _BRING)]))
+
+    def _by_codes(self, descriptor: Float32[NDArray[np.float32], " D"], k: int) -> Int64[NDArray[np.int64], " n"]:
+        """Return the k most similar views by their codes, the best first. Fewer only if the graph does not lead to all lists."""
         asked, probes = self._axes.apply(descriptor[None]), self.probes
         while True:
-            # The graph lists the nearest centroids well only if it keeps as many candidates as it shall return.
+            # The graph finds the nearest centroids only if it keeps as many candidates as it shall return.
             graph = faiss.SearchParametersHNSW(efSearch=max(probes, _LEAST_CANDIDATES))
             reading = faiss.SearchParametersIVF(nprobe=probes, quantizer_params=graph)
             found: NDArray[np.int64] = self._lists.search(asked, k, params=reading)[1][0]
             found = found[found >= 0]
             if len(found) == k or probes >= self.lists:
                 return found
-            probes *= 2
+            probes *= 2  # these lists have fewer than k views
+
+    def _neighbours(self, views: Int64[NDArray[np.int64], " n"]) -> Int64[NDArray[np.int64], " m"]:
+        """Return views around some views: of places next to theirs in the survey, at headings next to theirs."""
+        place, heading = np.divmod(views, self._headings)
+        turned = (heading[:, None] + np.arange(-_TURNS, _TURNS + 1)) % self._headings
+        along = place[:, None] + np.arange(-_PLACES, _PLACES + 1)
+        around = (along[:, :, None] * self._headings + turned[:, None, :]).ravel()
+        return around[(around >= 0) & (around < self._lists.ntotal)]
 
 
 @contextmanager
@@ -211,16 +229,17 @@ def _add(whole: faiss.IndexPreTransform, numbers: Rows) -> None:
     whole.ntotal = inverted.ntotal
 
 
-def _choose_probes(whole: faiss.IndexPreTransform, numbers: Rows) -> float:
+def _choose_probes(whole: faiss.IndexPreTransform, numbers: Rows, headings: int) -> float:
     """Set about the smallest number of probes that reaches the recall wanted; return the recall.
 
     Args:
         whole: index of all views.
         numbers: their descriptors.
+        headings: number of views per place.
     """
     asked = _queries(numbers)
     tenth = _tenth_best(numbers, asked)
-    inverted, opened = faiss.downcast_index(whole.index), InvertedFile(whole)
+    inverted, opened = faiss.downcast_index(whole.index), InvertedFile(whole, headings)
     probes = 1.0
     while True:
         inverted.nprobe = min(round(probes), inverted.nlist)

@@ -169,9 +169,12 @@ def _require_files(path: Path, manifest: Manifest, *, verify: bool) -> None:
 def _view_index(path: Path, manifest: Manifest, *, verify: bool) -> ViewIndex:
     inverted = None
     if inverted_file.FILE in manifest.files:
-        counts = manifest.counts
         inverted = InvertedFile.open(
-            path / inverted_file.FILE, views=counts.views, dimension=counts.descriptor_size, verify=verify
+            path / inverted_file.FILE,
+            views=manifest.counts.views,
+            dimension=manifest.counts.descriptor_size,
+            headings=manifest.headings,
+            verify=verify,
         )
     return ViewIndex.open(path / index.FILE, shortlister=inverted)
 

@@ -141,10 +141,12 @@ def _write_files(folder: Path, content: BundleContent) -> Manifest:
         writers[f"{parts.CLOUD_FOLDER}/{name}.npy"] = _array_writer(array)
     measured: dict[str, float] = {}
     if len(content.descriptors) >= inverted_file.SMALLEST:
-        # after the descriptors, from which it is made
-        writers[inverted_file.FILE] = lambda path: measured.update(
-            {inverted_file.RECALL: inverted_file.write_inverted_file(path, index.read_descriptors(folder / index.FILE))}
-        )
+
+        def write_index(path: Path) -> None:  # after the descriptors, from which it is made
+            numbers = index.read_descriptors(folder / index.FILE)
+            measured[inverted_file.RECALL] = inverted_file.write_inverted_file(path, numbers, headings=content.headings)
+
+        writers[inverted_file.FILE] = write_index
     for name, write in writers.items():
         write(folder / name)
         _sync(folder / name)
