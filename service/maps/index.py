@@ -99,7 +99,7 @@ class Shortlister(Protocol):
     """Finds views that may be similar to a query, much faster than an exact comparison with all of them."""
 
     def shortlist(self, descriptor: Float32[NDArray[np.float32], " D"], k: int) -> Int64[NDArray[np.int64], " k"]:
-        """Return the indices of about the k most similar views, in no particular order. A few more or fewer than k are allowed.
+        """Return the indices of about the k most similar views, in no particular order, perhaps with neighbours.
 
         Args:
             descriptor: descriptor of the query view.
@@ -182,7 +182,7 @@ class ViewIndex:
         return int(self._numbers.shape[1])
 
     def shortlist(self, descriptor: Float32[NDArray[np.float32], " D"], k: int) -> Int64[NDArray[np.int64], " k"]:
-        """Return the indices of about the k most similar views, in no particular order.
+        """Return the indices of about the k most similar views, in no particular order, perhaps with neighbours.
 
         The caller then compares the listed views exactly with ``vectors``. The list must be several times longer than the number of
         wanted views (decision 0046).

@@ -33,9 +33,9 @@ _OUTLIERS = 0.005
 _LINKS = 32
 #: Fewest candidates of a search in the graph. More find nearer centroids and take longer.
 _LEAST_CANDIDATES = 64
-#: Of a list of k views, a half comes from the codes. The best sixth brings its neighbours: views of so many places before and after it,
+#: The best third of the views that the codes list brings its neighbours: views of so many places before and after it in the survey,
 #: at headings so far away.
-_FROM_CODES, _BRING, _PLACES, _TURNS = 2, 6, 2, 1
+_BRING, _PLACES, _TURNS = 3, 2, 1
 #: Steps of k-means, and views for each centroid that it takes into account.
 _STEPS, _VIEWS_PER_LIST = 6, 16
 #: Smallest number of views that determine axes and ranges.
@@ -152,13 +152,13 @@ class InvertedFile:
         return int(self._lists.nprobe)
 
     def shortlist(self, descriptor: Float32[NDArray[np.float32], " D"], k: int) -> Int64[NDArray[np.int64], " n"]:
-        """Return the indices of about the k most similar views, ascending. There may be a few times more or fewer than k.
+        """Return the indices of about the k most similar views and of their neighbours, ascending: up to six times k.
 
         Args:
             descriptor: descriptor of the query view.
             k: length of the list, at most the number of views.
         """
-        found = self._by_codes(descriptor, -(-k // _FROM_CODES))
+        found = self._by_codes(descriptor, k)
         return np.union1d(found, self._neighbours(found[: -(-k // _BRING)]))
 
     def _by_codes(self, descriptor: Float32[NDArray[np.float32], " D"], k: int) -> Int64[NDArray[np.int64], " n"]:

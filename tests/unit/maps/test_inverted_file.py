@@ -62,9 +62,9 @@ def large(content_of: Callable[..., BundleContent]) -> BundleContent:
     )
 
 
-# 4 sqrt(100) = 40 lies nearer to 32 than to 64 on a logarithmic scale; 4 sqrt(489,000) = 2797; 4 sqrt(48.9 million) = 27,971.
+# 8 sqrt(100) = 80 lies nearer to 64 than to 128 on a logarithmic scale; 8 sqrt(489,000) = 5594; 8 sqrt(48.9 million) = 55,943.
 @pytest.mark.parametrize(
-    ("views", "lists"), [(1, 4), (16, 16), (100, 32), (489_000, 2048), (1_000_000, 4096), (48_900_000, 32_768)]
+    ("views", "lists"), [(1, 8), (16, 32), (100, 64), (489_000, 4096), (1_000_000, 8192), (48_900_000, 65_536)]
 )
 def test_the_number_of_lists_follows_the_root_of_the_number_of_views(views: int, lists: int) -> None:
     assert lists_for(views) == lists
