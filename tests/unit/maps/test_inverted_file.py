@@ -24,7 +24,7 @@ from service.maps.reader import MapBundle
 from service.maps.writer import sha256_of, write_bundle
 from service.retrieval.knn import search_views
 
-VIEWS, SIZE, PLACES = 3000, 16, 100
+VIEWS, SIZE, PLACES, HEADINGS = 3000, 16, 100, 4
 
 
 def unit_vectors(count: int, size: int, seed: int = 0) -> np.ndarray:
@@ -38,13 +38,13 @@ def written(tmp_path_factory: pytest.TempPathFactory) -> SimpleNamespace:
     folder = tmp_path_factory.mktemp("inverted")
     write_descriptors(folder / "d.npy", unit_vectors(VIEWS, SIZE))
     numbers = read_descriptors(folder / "d.npy")
-    recall = write_inverted_file(folder / FILE, numbers)
+    recall = write_inverted_file(folder / FILE, numbers, headings=HEADINGS)
     return SimpleNamespace(path=folder / FILE, numbers=numbers, recall=recall)
 
 
 @pytest.fixture(scope="module")
 def opened(written: SimpleNamespace) -> InvertedFile:
-    return InvertedFile.open(written.path, views=VIEWS, dimension=SIZE)
+    return InvertedFile.open(written.path, views=VIEWS, dimension=SIZE, headings=HEADINGS)
 
 
 @pytest.fixture(scope="module")
@@ -71,11 +71,11 @@ def test_the_number_of_lists_follows_the_root_of_the_number_of_views(views: int,
 
 
 def test_a_shortlist_holds_the_most_similar_views(written: SimpleNamespace, opened: InvertedFile) -> None:
-    assert written.recall >= 0.995
+    assert written.recall >= 0.992
     stored, found = vectors_of(written.numbers), 0
     for query in unit_vectors(50, SIZE, seed=1):
         listed = opened.shortlist(query, 1440)
-        assert len(np.unique(listed)) == len(listed) == 1440
+        assert 1440 <= len(listed) == len(np.unique(listed))
         found += len(set(np.argsort(-(stored @ query))[:10].tolist()) & set(listed.tolist()))
     assert found >= 0.98 * 500
 
@@ -85,13 +85,39 @@ def test_a_shortlist_holds_the_most_similar_views(written: SimpleNamespace, open
 def test_a_shortlist_has_different_views_of_the_map(opened: InvertedFile, k: int, seed: int) -> None:
     """A list longer than the lists read first makes the search read more of them."""
     listed = opened.shortlist(unit_vectors(1, SIZE, seed=seed)[0], k)
-    assert len(np.unique(listed)) == len(listed) == k
+    assert k <= len(listed) <= k + 15 * -(-k // 3)
+    assert (np.diff(listed) > 0).all()
     assert 0 <= listed.min() <= listed.max() < VIEWS
 
 
 def test_a_longer_list_has_all_views_of_a_shorter_one(opened: InvertedFile) -> None:
     query = unit_vectors(1, SIZE, seed=5)[0]
     assert set(opened.shortlist(query, 50).tolist()) <= set(opened.shortlist(query, 400).tolist())
+
+
+def test_the_neighbours_of_a_view_are_those_of_the_next_places_at_the_next_headings(opened: InvertedFile) -> None:
+    """View 21 has place 5 and heading 1 of 4. View 0 has place 0, so no places before it, and the heading before 0 is 3."""
+    expected = [4 * place + heading for place in (3, 4, 5, 6, 7) for heading in (0, 1, 2)]
+    assert opened._neighbours(np.array([21])).tolist() == expected
+    assert sorted(opened._neighbours(np.array([0])).tolist()) == [0, 1, 3, 4, 5, 7, 8, 9, 11]
+    assert sorted(opened._neighbours(np.array([VIEWS - 1])).tolist()) == [
+        2988,
+        2990,
+        2991,
+        2992,
+        2994,
+        2995,
+        2996,
+        2998,
+        2999,
+    ]
+
+
+def test_a_shortlist_has_the_neighbours_of_its_best_third(opened: InvertedFile) -> None:
+    query = unit_vectors(1, SIZE, seed=4)[0]
+    best = opened._by_codes(query, 30)
+    expected = set(best.tolist()) | set(opened._neighbours(best[:10]).tolist())
+    assert set(opened.shortlist(query, 30).tolist()) == expected
 
 
 def test_recall_counts_the_ten_best_views_that_are_listed(opened: InvertedFile, written: SimpleNamespace) -> None:
@@ -121,29 +147,34 @@ def test_the_same_descriptors_give_the_same_bytes_for_any_number_of_cores(
 ) -> None:
     monkeypatch.setattr(os, "cpu_count", lambda: cores)
     faiss.omp_set_num_threads(cores)
-    write_inverted_file(tmp_path / FILE, written.numbers)
+    write_inverted_file(tmp_path / FILE, written.numbers, headings=HEADINGS)
     assert faiss.omp_get_max_threads() == cores, "the caller's number of threads stays"
     assert (tmp_path / FILE).read_bytes() == written.path.read_bytes()
 
 
-def test_a_view_takes_at_most_its_code_and_its_number(written: SimpleNamespace) -> None:
-    """Four axes share a byte, so 16 components take 4 bytes, and the number of the view takes 8."""
-    inverted = faiss.downcast_index(faiss.read_index(str(written.path)).index)
-    assert inverted.code_size == 4
+def test_a_view_takes_four_bits_per_axis_and_its_number(written: SimpleNamespace) -> None:
+    """16 components have 16 axes, so a code has 8 bytes. The number of the view takes 8 more."""
+    whole = faiss.read_index(str(written.path))  # keeps its parts alive
+    inverted = faiss.downcast_index(whole.index)
+    assert inverted.code_size == 8
     assert inverted.invlists.compute_ntotal() == VIEWS
+    assert written.path.stat().st_size > 16 * VIEWS
 
 
 def test_an_odd_number_of_components_has_an_index_too(tmp_path: Path) -> None:
     write_descriptors(tmp_path / "d.npy", unit_vectors(600, 7))
-    write_inverted_file(tmp_path / FILE, read_descriptors(tmp_path / "d.npy"))
-    assert len(InvertedFile.open(tmp_path / FILE, views=600, dimension=7).shortlist(unit_vectors(1, 7)[0], 20)) == 20
+    write_inverted_file(tmp_path / FILE, read_descriptors(tmp_path / "d.npy"), headings=1)
+    assert (
+        len(InvertedFile.open(tmp_path / FILE, views=600, dimension=7, headings=1).shortlist(unit_vectors(1, 7)[0], 20))
+        >= 20
+    )
 
 
 @pytest.mark.parametrize("kept", [0, 3, 100, 2000, -1])
 def test_a_truncated_file_is_refused(written: SimpleNamespace, tmp_path: Path, kept: int) -> None:
     (tmp_path / FILE).write_bytes(written.path.read_bytes()[:kept])
     with pytest.raises(BundleError, match=rf"{FILE}: .*; copy or build the bundle again"):
-        InvertedFile.open(tmp_path / FILE, views=VIEWS, dimension=SIZE)
+        InvertedFile.open(tmp_path / FILE, views=VIEWS, dimension=SIZE, headings=HEADINGS)
 
 
 @pytest.mark.parametrize(
@@ -157,7 +188,7 @@ def test_the_index_of_another_map_is_refused(
     written: SimpleNamespace, views: int, dimension: int, message: str
 ) -> None:
     with pytest.raises(BundleError, match=message):
-        InvertedFile.open(written.path, views=views, dimension=dimension)
+        InvertedFile.open(written.path, views=views, dimension=dimension, headings=HEADINGS)
 
 
 def test_another_kind_of_index_is_refused(tmp_path: Path) -> None:
@@ -165,10 +196,10 @@ def test_another_kind_of_index_is_refused(tmp_path: Path) -> None:
     flat.add(unit_vectors(10, SIZE))
     faiss.write_index(flat, str(tmp_path / FILE))
     with pytest.raises(BundleError, match="IndexFlatIP instead of principal axes with an inverted file; copy or build"):
-        InvertedFile.open(tmp_path / FILE, views=10, dimension=SIZE)
+        InvertedFile.open(tmp_path / FILE, views=10, dimension=SIZE, headings=HEADINGS)
     faiss.write_index(faiss.IndexPreTransform(faiss.PCAMatrix(SIZE, 4), faiss.IndexFlatIP(4)), str(tmp_path / FILE))
-    with pytest.raises(BundleError, match="PCAMatrix and IndexFlatIP instead of PCAMatrix and IndexIVFPQ"):
-        InvertedFile.open(tmp_path / FILE, views=0, dimension=SIZE)
+    with pytest.raises(BundleError, match="PCAMatrix and IndexFlatIP instead of PCAMatrix and IndexIVFScalarQuantizer"):
+        InvertedFile.open(tmp_path / FILE, views=0, dimension=SIZE, headings=HEADINGS)
 
 
 @pytest.mark.parametrize(
@@ -180,7 +211,8 @@ def test_lists_with_wrong_views_are_refused(
 ) -> None:
     """The last eight bytes of the lists are the number of a view. ``None`` gives it the number before."""
     data = bytearray(written.path.read_bytes())
-    inverted = faiss.downcast_index(faiss.read_index(str(written.path), faiss.IO_FLAG_MMAP).index)
+    whole = faiss.read_index(str(written.path), faiss.IO_FLAG_MMAP)  # keeps its parts alive
+    inverted = faiss.downcast_index(whole.index)
     lists = faiss.downcast_InvertedLists(inverted.invlists).lists
     last = next(lists.at(n) for n in reversed(range(inverted.nlist)) if lists.at(n).size > 1)
     end = last.offset + last.size * (inverted.code_size + 8)
@@ -188,8 +220,8 @@ def test_lists_with_wrong_views_are_refused(
     data[end - 8 : end] = forged
     (tmp_path / FILE).write_bytes(data)
     with pytest.raises(BundleError, match=message):
-        InvertedFile.open(tmp_path / FILE, views=VIEWS, dimension=SIZE)
-    InvertedFile.open(tmp_path / FILE, views=VIEWS, dimension=SIZE, verify=False)
+        InvertedFile.open(tmp_path / FILE, views=VIEWS, dimension=SIZE, headings=HEADINGS)
+    InvertedFile.open(tmp_path / FILE, views=VIEWS, dimension=SIZE, headings=HEADINGS, verify=False)
 
 
 def test_a_map_below_the_size_has_no_index(
@@ -235,7 +267,7 @@ def test_a_map_without_its_index_still_opens(indexed: Path) -> None:
     """A bundle of format 4 that was built before there was an index."""
     document = json.loads((indexed / "manifest.json").read_text())
     del document["files"][FILE]
-    (indexed / "manifest.json").write_bytes(Manifest.model_construct(**document).stamped().to_bytes())
+    (indexed / "manifest.json").write_bytes(Manifest.model_validate_json(json.dumps(document)).stamped().to_bytes())
     (indexed / FILE).unlink()
     assert isinstance(MapBundle.open(indexed).view_index._shortlister, ScannedCopy)
 
@@ -269,4 +301,4 @@ def test_merging_measures_the_recall_again(indexed: Path, large: BundleContent) 
     assert 0.9 <= made.parameters[RECALL] <= 1
     bundle = MapBundle.open(indexed.parent / "both")
     assert isinstance(bundle.view_index._shortlister, InvertedFile)
-    assert len(bundle.view_index.shortlist(bundle.view_index.vectors(np.arange(1))[0], 30)) == 30
+    assert len(bundle.view_index.shortlist(bundle.view_index.vectors(np.arange(1))[0], 30)) >= 30
