@@ -282,8 +282,11 @@ def _tenth_best(numbers: Rows, asked: _Asked) -> Float32[NDArray[np.float32], " 
     """Return the similarity of the tenth best view of each query by exact search, or of the last one of fewer views."""
     kept = np.full((len(asked), min(_BEST, len(numbers))), -np.inf, np.float32)
     for first in range(0, len(numbers), _CHUNK):
-        both = np.concatenate([kept, asked @ vectors_of(numbers[first : first + _CHUNK]).T], axis=1)
-        kept = -np.partition(-both, kept.shape[1] - 1, axis=1)[:, : kept.shape[1]]
+        similar = asked @ vectors_of(numbers[first : first + _CHUNK]).T
+        least = kept.min(axis=1, keepdims=True)
+        for query in np.flatnonzero((similar > least).any(axis=1)):
+            both = np.concatenate([kept[query], similar[query][similar[query] > least[query]]])
+            kept[query] = -np.partition(-both, kept.shape[1] - 1)[: kept.shape[1]]
     return kept.min(axis=1)
 
 
