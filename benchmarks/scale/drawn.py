@@ -80,7 +80,8 @@ class DrawnViews:
         mixed = self._part[one] + self._part[other]
         mixed += self._mean
         mixed *= 127 / np.abs(mixed).max(axis=1, keepdims=True)
-        return np.rint(mixed, out=mixed).astype(np.int8)
+        rounded: NDArray[np.int8] = np.rint(mixed, out=mixed).astype(np.int8)
+        return rounded
 
     def _parts_of(self, numbers: Int64[NDArray[np.int64], " n"]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """Return the two real views of some drawn views."""

@@ -200,4 +200,5 @@ def tenth_best(numbers: DrawnViews, asked: Asked) -> Float32[NDArray[np.float32]
         for query in np.unique(queries):
             both = np.concatenate([kept[query], similar[rows[queries == query], query]])
             kept[query] = -np.partition(-both, BEST - 1)[:BEST]
-    return kept.min(axis=1)
+    tenth: NDArray[np.float32] = kept.min(axis=1)
+    return tenth

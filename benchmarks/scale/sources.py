@@ -74,14 +74,16 @@ def real_descriptors(runs: Runs) -> RealDescriptors:
     Args:
         runs: simulates and builds, or reuses what is kept on disk.
     """
-    views, queries, true_view = [], [], []
+    views: list[NDArray[np.float32]] = []
+    queries: list[NDArray[np.float32]] = []
+    true_view: list[int] = []
     for index in range(CITIES):
         dataset = runs.dataset(city_plan(index))
         settings = BuildSettings(
             name=dataset.name, headings=HEADINGS, align_survey=False, traffic_vote=False, calibration=None
         )
         bundle = runs.bundle(dataset, settings)
-        first = sum(map(len, views))
+        first = sum(len(each) for each in views)
         views.append(bundle.view_index.vectors(np.arange(bundle.manifest.counts.views)))
         for asked, true in _queries(dataset, bundle):
             queries.append(asked)

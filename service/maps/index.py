@@ -69,7 +69,7 @@ def read_descriptors(path: Path) -> Int8[NDArray[np.int8], "n D"]:
         BundleError: the file is not an array of 8-bit numbers with a row per view.
     """
     try:
-        numbers = np.load(path, allow_pickle=False, mmap_mode="r")
+        numbers: NDArray[np.int8] = np.load(path, allow_pickle=False, mmap_mode="r")
     except (OSError, *NPY_HEADER_ERRORS) as error:
         raise BundleError(
             f"{path}: not a valid NPY array ({error}); copy or build the bundle again", field=FILE
@@ -119,7 +119,8 @@ class ScannedCopy:
     def __init__(self, numbers: Int8[NDArray[np.int8], "n D"]) -> None:
         size = numbers.shape[1]
         if len(numbers) < _FEWEST:
-            self._copy, self._mean = faiss.IndexFlatIP(size), np.zeros(size, np.float32)
+            self._copy: faiss.Index = faiss.IndexFlatIP(size)
+            self._mean = np.zeros(size, np.float32)
             self._copy.add(vectors_of(numbers))
             return
         axes = faiss.PCAMatrix(size, min(_AXES, size))

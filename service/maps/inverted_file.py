@@ -50,6 +50,8 @@ _NOISE = 0.6
 _WANTED, _GROWTH = 0.992, 2**0.5
 _REMEDY = "copy or build the bundle again"
 _Asked = Float32[NDArray[np.float32], "q D"]
+#: FAISS without its type stubs, which lack many of the classes and fields that this file uses.
+_faiss: Any = faiss
 
 
 @runtime_checkable
@@ -85,7 +87,7 @@ def write_inverted_file(path: Path, numbers: Rows, *, headings: int) -> float:
         whole = _trained(numbers)
         _add(whole, numbers)
         recall = _choose_probes(whole, numbers, headings)
-        faiss.write_index(whole, str(path))
+        _faiss.write_index(whole, str(path))
     return recall
 
 
@@ -106,11 +108,11 @@ class InvertedFile:
         headings: number of views per place.
     """
 
-    def __init__(self, whole: faiss.IndexPreTransform, headings: int) -> None:
+    def __init__(self, whole: Any, headings: int) -> None:
         self._headings = headings
         self._whole = whole  # keeps the parts below alive
-        self._axes = faiss.downcast_VectorTransform(whole.chain.at(0))
-        self._lists = faiss.downcast_index(whole.index)
+        self._axes = _faiss.downcast_VectorTransform(whole.chain.at(0))
+        self._lists = _faiss.downcast_index(whole.index)
 
     @classmethod
     def open(cls, path: Path, *, views: int, dimension: int, headings: int, verify: bool = True) -> "InvertedFile":
@@ -128,17 +130,17 @@ class InvertedFile:
         """
         index.search_with_one_thread()
         try:
-            whole = faiss.read_index(str(path), faiss.IO_FLAG_MMAP | faiss.IO_FLAG_READ_ONLY)
+            whole = _faiss.read_index(str(path), _faiss.IO_FLAG_MMAP | _faiss.IO_FLAG_READ_ONLY)
         except RuntimeError as error:
             reason = str(error).splitlines()[0].rpartition("Error: ")[2]
             raise _defect(path, f"not a valid FAISS index ({reason})") from error
         wrong = _unlike(whole, views, dimension, path.stat().st_size)
         if not wrong and verify:
-            wrong = _inconsistent(faiss.downcast_index(whole.index))
+            wrong = _inconsistent(_faiss.downcast_index(whole.index))
         if wrong:
             raise _defect(path, wrong)
         # FAISS would start 32 threads for each search, which read the lists in advance (2 ms).
-        faiss.downcast_InvertedLists(faiss.downcast_index(whole.index).invlists).prefetch_nthread = 0
+        _faiss.downcast_InvertedLists(_faiss.downcast_index(whole.index).invlists).prefetch_nthread = 0
         return cls(whole, headings)
 
     @property
@@ -166,8 +168,8 @@ class InvertedFile:
         asked, probes = self._axes.apply(descriptor[None]), self.probes
         while True:
             # The graph finds the nearest centroids only if it keeps as many candidates as it shall return.
-            graph = faiss.SearchParametersHNSW(efSearch=max(probes, _LEAST_CANDIDATES))
-            reading = faiss.SearchParametersIVF(nprobe=probes, quantizer_params=graph)
+            graph = _faiss.SearchParametersHNSW(efSearch=max(probes, _LEAST_CANDIDATES))
+            reading = _faiss.SearchParametersIVF(nprobe=probes, quantizer_params=graph)
             found: NDArray[np.int64] = self._lists.search(asked, k, params=reading)[1][0]
             found = found[found >= 0]
             if len(found) == k or probes >= self.lists:
@@ -180,31 +182,32 @@ class InvertedFile:
         turned = (heading[:, None] + np.arange(-_TURNS, _TURNS + 1)) % self._headings
         along = place[:, None] + np.arange(-_PLACES, _PLACES + 1)
         around = (along[:, :, None] * self._headings + turned[:, None, :]).ravel()
-        return around[(around >= 0) & (around < self._lists.ntotal)]
+        inside: NDArray[np.int64] = around[(around >= 0) & (around < self._lists.ntotal)]
+        return inside
 
 
 @contextmanager
 def _threads(count: int) -> Iterator[None]:
     """Make FAISS use some threads. With more than one, the graph and the rounding of sums depend on them, but no search does."""
-    before = faiss.omp_get_max_threads()
-    faiss.omp_set_num_threads(count)
+    before = _faiss.omp_get_max_threads()
+    _faiss.omp_set_num_threads(count)
     try:
         yield
     finally:
-        faiss.omp_set_num_threads(before)
+        _faiss.omp_set_num_threads(before)
 
 
-def _trained(numbers: Rows) -> faiss.IndexPreTransform:
+def _trained(numbers: Rows) -> Any:
     """Return an index with axes, centroids and codes, but without views."""
     size, lists = numbers.shape[1], lists_for(len(numbers))
     name = f"PCA{min(_AXES, size)},IVF{lists}_HNSW{_LINKS},SQ4"
-    whole = faiss.index_factory(size, name, faiss.METRIC_INNER_PRODUCT)
-    axes, inverted = faiss.downcast_VectorTransform(whole.chain.at(0)), faiss.downcast_index(whole.index)
+    whole = _faiss.index_factory(size, name, _faiss.METRIC_INNER_PRODUCT)
+    axes, inverted = _faiss.downcast_VectorTransform(whole.chain.at(0)), _faiss.downcast_index(whole.index)
     settings = inverted.cp
     settings.niter, settings.max_points_per_centroid, settings.min_points_per_centroid = _STEPS, _VIEWS_PER_LIST, 1
-    inverted.sq.rangestat, inverted.sq.rangestat_arg = faiss.ScalarQuantizer.RS_quantiles, _OUTLIERS
+    inverted.sq.rangestat, inverted.sq.rangestat_arg = _faiss.ScalarQuantizer.RS_quantiles, _OUTLIERS
     # Comparing every view with every centroid would take an hour for 50 million views.
-    graph = faiss.IndexHNSWFlat(inverted.d, _LINKS, faiss.METRIC_INNER_PRODUCT)
+    graph = _faiss.IndexHNSWFlat(inverted.d, _LINKS, _faiss.METRIC_INNER_PRODUCT)
     inverted.clustering_index = graph
     count = min(len(numbers), max(_SAMPLE, _VIEWS_PER_LIST * lists))
     # Drawn at random, because views at equal distances may all have one heading.
@@ -219,9 +222,9 @@ def _trained(numbers: Rows) -> faiss.IndexPreTransform:
     return whole
 
 
-def _add(whole: faiss.IndexPreTransform, numbers: Rows) -> None:
+def _add(whole: Any, numbers: Rows) -> None:
     """Add all views in their order. Lists and codes of a view do not depend on the number of threads."""
-    axes, inverted = faiss.downcast_VectorTransform(whole.chain.at(0)), faiss.downcast_index(whole.index)
+    axes, inverted = _faiss.downcast_VectorTransform(whole.chain.at(0)), _faiss.downcast_index(whole.index)
     for first in range(0, len(numbers), _CHUNK):
         along = axes.apply(vectors_of(numbers[first : first + _CHUNK]))
         with _threads(os.cpu_count() or 1):
@@ -229,7 +232,7 @@ def _add(whole: faiss.IndexPreTransform, numbers: Rows) -> None:
     whole.ntotal = inverted.ntotal
 
 
-def _choose_probes(whole: faiss.IndexPreTransform, numbers: Rows, headings: int) -> float:
+def _choose_probes(whole: Any, numbers: Rows, headings: int) -> float:
     """Set about the smallest number of probes that reaches the recall wanted; return the recall.
 
     Args:
@@ -239,7 +242,7 @@ def _choose_probes(whole: faiss.IndexPreTransform, numbers: Rows, headings: int)
     """
     asked = _queries(numbers)
     tenth = _tenth_best(numbers, asked)
-    inverted, opened = faiss.downcast_index(whole.index), InvertedFile(whole, headings)
+    inverted, opened = _faiss.downcast_index(whole.index), InvertedFile(whole, headings)
     probes = 1.0
     while True:
         inverted.nprobe = min(round(probes), inverted.nlist)
@@ -287,18 +290,19 @@ def _tenth_best(numbers: Rows, asked: _Asked) -> Float32[NDArray[np.float32], " 
         for query in np.flatnonzero((similar > least).any(axis=1)):
             both = np.concatenate([kept[query], similar[query][similar[query] > least[query]]])
             kept[query] = -np.partition(-both, kept.shape[1] - 1)[: kept.shape[1]]
-    return kept.min(axis=1)
+    tenth: NDArray[np.float32] = kept.min(axis=1)
+    return tenth
 
 
 def _unlike(whole: Any, views: int, dimension: int, size: int) -> str:
     """Return how an index differs from that of a map; empty if it fits."""
-    if not isinstance(whole, faiss.IndexPreTransform) or whole.chain.size() != 1:
+    if not isinstance(whole, _faiss.IndexPreTransform) or whole.chain.size() != 1:
         return f"{type(whole).__name__} instead of principal axes with an inverted file"
-    axes, inverted = faiss.downcast_VectorTransform(whole.chain.at(0)), faiss.downcast_index(whole.index)
-    if not isinstance(axes, faiss.PCAMatrix) or not isinstance(inverted, faiss.IndexIVFScalarQuantizer):
+    axes, inverted = _faiss.downcast_VectorTransform(whole.chain.at(0)), _faiss.downcast_index(whole.index)
+    if not isinstance(axes, _faiss.PCAMatrix) or not isinstance(inverted, _faiss.IndexIVFScalarQuantizer):
         return f"{type(axes).__name__} and {type(inverted).__name__} instead of PCAMatrix and IndexIVFScalarQuantizer"
-    graph, lists = faiss.downcast_index(inverted.quantizer), faiss.downcast_InvertedLists(inverted.invlists)
-    if not isinstance(graph, faiss.IndexHNSWFlat) or not isinstance(lists, faiss.OnDiskInvertedLists):
+    graph, lists = _faiss.downcast_index(inverted.quantizer), _faiss.downcast_InvertedLists(inverted.invlists)
+    if not isinstance(graph, _faiss.IndexHNSWFlat) or not isinstance(lists, _faiss.OnDiskInvertedLists):
         return f"{type(graph).__name__} and {type(lists).__name__} instead of IndexHNSWFlat and OnDiskInvertedLists"
     if inverted.ntotal != views or lists.compute_ntotal() != views:
         return f"{inverted.ntotal} views in its head and {lists.compute_ntotal()} in its lists instead of {views}"
@@ -308,7 +312,7 @@ def _unlike(whole: Any, views: int, dimension: int, size: int) -> str:
         return f"{graph.ntotal} centroids and {inverted.nprobe} probes for {inverted.nlist} lists"
     last = lists.lists.at(inverted.nlist - 1)
     if (
-        inverted.sq.qtype != faiss.ScalarQuantizer.QT_4bit
+        inverted.sq.qtype != _faiss.ScalarQuantizer.QT_4bit
         or inverted.code_size != (inverted.d + 1) // 2
         or last.offset + last.size * (inverted.code_size + 8) > size
     ):
@@ -316,21 +320,21 @@ def _unlike(whole: Any, views: int, dimension: int, size: int) -> str:
     return ""
 
 
-def _inconsistent(inverted: faiss.IndexIVFScalarQuantizer) -> str:
+def _inconsistent(inverted: Any) -> str:
     """Return which reference of an index leads nowhere; empty if there is none."""
-    lists, seen = faiss.downcast_InvertedLists(inverted.invlists), np.zeros(inverted.ntotal, np.bool_)
+    lists, seen = _faiss.downcast_InvertedLists(inverted.invlists), np.zeros(inverted.ntotal, np.bool_)
     for number in range(inverted.nlist):
         count = lists.list_size(number)
         if not count:
             continue
-        views: NDArray[np.int64] = faiss.rev_swig_ptr(lists.get_ids(number), count)
+        views: NDArray[np.int64] = _faiss.rev_swig_ptr(lists.get_ids(number), count)
         if views.min() < 0 or views.max() >= len(seen):
             return f"list {number} refers to a missing view"
         seen[views] = True
     if not seen.all():
         return f"{int((~seen).sum())} views are in no list"
-    graph = faiss.downcast_index(inverted.quantizer).hnsw
-    neighbours = faiss.vector_to_array(graph.neighbors)
+    graph = _faiss.downcast_index(inverted.quantizer).hnsw
+    neighbours = _faiss.vector_to_array(graph.neighbors)
     if len(neighbours) and not -1 <= neighbours.min() <= neighbours.max() < inverted.nlist:
         return "the graph refers to a missing centroid"
     return ""

@@ -4,6 +4,7 @@ import os
 from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import faiss
 import numpy as np
@@ -154,8 +155,8 @@ def test_the_same_descriptors_give_the_same_bytes_for_any_number_of_cores(
 
 def test_a_view_takes_four_bits_per_axis_and_its_number(written: SimpleNamespace) -> None:
     """16 components have 16 axes, so a code has 8 bytes. The number of the view takes 8 more."""
-    whole = faiss.read_index(str(written.path))  # keeps its parts alive
-    inverted = faiss.downcast_index(whole.index)
+    whole: Any = faiss.read_index(str(written.path))  # keeps its parts alive
+    inverted: Any = faiss.downcast_index(whole.index)
     assert inverted.code_size == 8
     assert inverted.invlists.compute_ntotal() == VIEWS
     assert written.path.stat().st_size > 16 * VIEWS
@@ -211,9 +212,10 @@ def test_lists_with_wrong_views_are_refused(
 ) -> None:
     """The last eight bytes of the lists are the number of a view. ``None`` gives it the number before."""
     data = bytearray(written.path.read_bytes())
-    whole = faiss.read_index(str(written.path), faiss.IO_FLAG_MMAP)  # keeps its parts alive
-    inverted = faiss.downcast_index(whole.index)
-    lists = faiss.downcast_InvertedLists(inverted.invlists).lists
+    whole: Any = faiss.read_index(str(written.path), faiss.IO_FLAG_MMAP)  # keeps its parts alive
+    inverted: Any = faiss.downcast_index(whole.index)
+    mapped: Any = faiss.downcast_InvertedLists(inverted.invlists)
+    lists = mapped.lists
     last = next(lists.at(n) for n in reversed(range(inverted.nlist)) if lists.at(n).size > 1)
     end = last.offset + last.size * (inverted.code_size + 8)
     forged = data[end - 16 : end - 8] if number is None else np.int64(number).tobytes()
