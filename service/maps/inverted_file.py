@@ -206,7 +206,7 @@ def _trained(numbers: Rows) -> Any:
     settings = inverted.cp
     settings.niter, settings.max_points_per_centroid, settings.min_points_per_centroid = _STEPS, _VIEWS_PER_LIST, 1
     inverted.sq.rangestat, inverted.sq.rangestat_arg = _faiss.ScalarQuantizer.RS_quantiles, _OUTLIERS
-    # Comparing every view with every centroid would take an hour for 50 million views.
+    # The graph finds the nearest centroid of a view without a comparison with all centroids.
     graph = _faiss.IndexHNSWFlat(inverted.d, _LINKS, _faiss.METRIC_INNER_PRODUCT)
     inverted.clustering_index = graph
     count = min(len(numbers), max(_SAMPLE, _VIEWS_PER_LIST * lists))
