@@ -38,7 +38,7 @@ export ORT_DISABLE_TELEMETRY := 1
 .DEFAULT_GOAL := help
 .NOTPARALLEL:
 .DELETE_ON_ERROR:
-.PHONY: help demo demo-real test test-service check check-native sanitize console check-console test-console format generate release-proto lock evaluate evaluate-real bench-kitti choices paper bench-training bench-serving fuzz chaos sbom audit reports docs docs-blocks house pictures encoder paper-encoder calibration install-demo install-test clean
+.PHONY: help demo demo-real test test-service check check-native sanitize console check-console test-console format generate release-proto lock evaluate evaluate-real bench-kitti choices paper bench-training bench-serving bench-scale fuzz chaos sbom audit reports docs docs-blocks house pictures encoder paper-encoder calibration install-demo install-test clean
 
 help: ## list all targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "make %-16s %s\n", $$1, $$2}' Makefile
@@ -148,6 +148,9 @@ bench-training: .venv/.torch ## measure training and simulation -> reports/train
 
 bench-serving: .venv/.torch ## measure the service under load -> reports/serving.json; ARGS="--only ratios tail" measures parts
 	$(BIN)/python -m benchmarks.serving $(ARGS)
+
+bench-scale: .venv/.torch ## search in maps of up to a hundred towns -> reports/scale.json; ARGS="--sizes 489000 10000000" measures some sizes
+	$(BIN)/python -m benchmarks.scale $(ARGS)
 
 fuzz: .venv/.torch ## a million inputs to every parser of untrusted input -> reports/serving.json
 	$(INSTALL) 'atheris>=3,<4'

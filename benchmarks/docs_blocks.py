@@ -47,6 +47,7 @@ PAGES = (
     "how_it_works",
     "architecture",
     "paper",
+    "scale",
     "limits",
     "faq",
     "index",

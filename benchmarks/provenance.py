@@ -103,6 +103,12 @@ MEASURED: dict[str, dict[str, tuple[str, ...]]] = {
         "real.peers.": (*_CORE, *_DATA, "model_training/importing", "research/baselines"),
         "ros2.": (*_CORE, "service/bridge"),
     },
+    "scale": {
+        "": (
+            *("service/maps/index.py", "service/maps/inverted_file.py", "service/retrieval", "service/imaging"),
+            "model_training/stock/encoder.onnx",
+        )
+    },
     "serving": {
         "": ("service", "native"),
         "fuzz.": _ALL,

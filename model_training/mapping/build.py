@@ -26,6 +26,7 @@ from model_training.mapping.voxel_map import VoxelMap, lattice_origin
 from model_training.mapping.work import key_of, work_beside
 from service.errors import BundleError, DatasetError
 from service.imaging.view_grid import ViewGrid
+from service.maps import inverted_file
 from service.maps.calibration import Calibration, Site
 from service.maps.content import BundleContent
 from service.maps.manifest import NAME, Manifest
@@ -188,8 +189,9 @@ def describe(manifest: Manifest) -> str:
     Args:
         manifest: manifest of the bundle.
     """
-    counts = manifest.counts
+    counts, recall = manifest.counts, manifest.parameters.get(inverted_file.RECALL)
+    search = "" if recall is None else f", search index with recall@10 of {recall:.3f} against exact search"
     return (
         f"map {manifest.name}, version {manifest.version}: {counts.places} places, {counts.views} views, "
-        f"{counts.cloud_points} cloud points, {counts.streets} street classes"
+        f"{counts.cloud_points} cloud points, {counts.streets} street classes{search}"
     )

@@ -12,6 +12,7 @@ from scipy.spatial import cKDTree
 
 from model_training.mapping.places import streets_of, views_of
 from service.errors import BundleError
+from service.maps import inverted_file
 from service.maps.content import BundleContent
 
 #: Parameters that may differ between two traversals of one map.
@@ -26,6 +27,7 @@ _OF_A_DRIVE = (
     "expected_lidar_height_m",
     "survey_position_std_m",
     "survey_angle_std_deg",
+    inverted_file.RECALL,  # the writer measures it again
 )
 #: Standard deviations of which the joined map keeps the larger one.
 _WORST = ("survey_position_std_m", "survey_angle_std_deg")

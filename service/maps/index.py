@@ -1,10 +1,12 @@
-"""The memory-mapped descriptors of the views, and a coarse copy in memory that makes a shortlist for them.
+"""The memory-mapped descriptors of the views, and the search for similar ones.
 
-A descriptor is stored as 8-bit numbers (decision 0155). FAISS makes the coarse copy: principal axes and 8-bit numbers. Decision 0144
-compares it with code of our own.
+A descriptor is stored as 8-bit numbers (decision 0155). A search makes a shortlist and compares it exactly. A coarse copy of all
+descriptors makes the shortlist. FAISS makes this copy: principal axes and 8-bit numbers. Decision 0144 compares it with code of our own.
+A large map has an index file instead of the copy (``inverted_file``).
 """
 
 from pathlib import Path
+from typing import Protocol, runtime_checkable
 
 import faiss
 import numpy as np
@@ -57,28 +59,91 @@ def write_descriptors(path: Path, descriptors: Descriptors) -> None:
     np.save(path, numbers, allow_pickle=False)
 
 
-def _vectors_of(numbers: Int8[NDArray[np.int8], "n D"]) -> Descriptors:
-    """Return the unit vectors of some 8-bit descriptors; a descriptor of zeros stays zero."""
+def read_descriptors(path: Path) -> Int8[NDArray[np.int8], "n D"]:
+    """Map a file of descriptors into memory.
+
+    Args:
+        path: file that ``write_descriptors`` wrote.
+
+    Raises:
+        BundleError: the file is not an array of 8-bit numbers with a row per view.
+    """
+    try:
+        numbers: NDArray[np.int8] = np.load(path, allow_pickle=False, mmap_mode="r")
+    except (OSError, *NPY_HEADER_ERRORS) as error:
+        raise BundleError(
+            f"{path}: not a valid NPY array ({error}); copy or build the bundle again", field=FILE
+        ) from error
+    if numbers.dtype != np.int8 or numbers.ndim != 2 or not numbers.shape[1] or not numbers.flags["C_CONTIGUOUS"]:
+        raise BundleError(
+            f"{path}: {numbers.dtype} of shape {numbers.shape} instead of int8 with a row per view; copy or build the "
+            "bundle again",
+            field=FILE,
+        )
+    return numbers
+
+
+def vectors_of(numbers: Int8[NDArray[np.int8], "n D"]) -> Descriptors:
+    """Return the unit vectors of some 8-bit descriptors; a descriptor of zeros stays zero.
+
+    Args:
+        numbers: 8-bit descriptors, a row per view.
+    """
     vectors = numbers.astype(np.float32)
     vectors /= np.maximum(np.sqrt(np.einsum("nd,nd->n", vectors, vectors)), 1)[:, None]
     return vectors
 
 
-def _coarse_copy(numbers: Int8[NDArray[np.int8], "n D"]) -> tuple[faiss.Index, Float32[NDArray[np.float32], " D"]]:
-    """Return an index of 8-bit components along the principal axes, and the mean descriptor that it subtracts.
+@runtime_checkable
+class Shortlister(Protocol):
+    """Finds views that may be similar to a query, much faster than an exact comparison with all of them."""
 
-    The copy is small, so a scan of it hardly waits for memory.
+    def shortlist(self, descriptor: Float32[NDArray[np.float32], " D"], k: int) -> Int64[NDArray[np.int64], " k"]:
+        """Return the indices of about the k most similar views, in no particular order, perhaps with neighbours.
+
+        Args:
+            descriptor: descriptor of the query view.
+            k: length of the list, at most the number of views.
+        """
+
+
+class ScannedCopy:
+    """Coarse copy in memory of all descriptors: 8-bit components along the principal axes. A search scans all of it.
+
+    The copy is small, so a scan of it hardly waits for memory. The copy of fewer than ``_FEWEST`` views is exact.
 
     Args:
-        numbers: descriptors of at least ``_FEWEST`` views.
+        numbers: 8-bit descriptors, a row per view.
     """
-    axes = faiss.PCAMatrix(numbers.shape[1], min(_AXES, numbers.shape[1]))
-    codes = faiss.IndexScalarQuantizer(axes.d_out, faiss.ScalarQuantizer.QT_8bit_uniform, faiss.METRIC_INNER_PRODUCT)
-    coarse = faiss.IndexPreTransform(axes, codes)
-    coarse.train(_vectors_of(numbers[:: -(-len(numbers) // _SAMPLE)]))
-    for first in range(0, len(numbers), _CHUNK):
-        coarse.add(_vectors_of(numbers[first : first + _CHUNK]))
-    return coarse, np.array(faiss.vector_to_array(axes.mean), np.float32)
+
+    def __init__(self, numbers: Int8[NDArray[np.int8], "n D"]) -> None:
+        size = numbers.shape[1]
+        if len(numbers) < _FEWEST:
+            self._copy: faiss.Index = faiss.IndexFlatIP(size)
+            self._mean = np.zeros(size, np.float32)
+            self._copy.add(vectors_of(numbers))
+            return
+        axes = faiss.PCAMatrix(size, min(_AXES, size))
+        codes = faiss.IndexScalarQuantizer(
+            axes.d_out, faiss.ScalarQuantizer.QT_8bit_uniform, faiss.METRIC_INNER_PRODUCT
+        )
+        self._copy = faiss.IndexPreTransform(axes, codes)
+        self._copy.train(vectors_of(numbers[:: -(-len(numbers) // _SAMPLE)]))
+        for first in range(0, len(numbers), _CHUNK):
+            self._copy.add(vectors_of(numbers[first : first + _CHUNK]))
+        self._mean = np.array(faiss.vector_to_array(axes.mean), np.float32)
+
+    def shortlist(self, descriptor: Float32[NDArray[np.float32], " D"], k: int) -> Int64[NDArray[np.int64], " k"]:
+        """Return the indices of approximately the k most similar views, in no particular order.
+
+        Args:
+            descriptor: descriptor of the query view.
+            k: length of the list, at most the number of views.
+        """
+        # The copy subtracts the mean from views and queries. Only views may lose it: then a similarity differs from the exact
+        # one by the same constant for all views.
+        found: NDArray[np.int64] = self._copy.search((descriptor + self._mean)[None], k)[1][0]
+        return found
 
 
 class ViewIndex:
@@ -86,42 +151,28 @@ class ViewIndex:
 
     Args:
         numbers: 8-bit descriptors, a row per view.
+        shortlister: makes the shortlists; None makes a coarse copy for them.
     """
 
-    def __init__(self, numbers: Int8[NDArray[np.int8], "n D"]) -> None:
+    def __init__(self, numbers: Int8[NDArray[np.int8], "n D"], shortlister: Shortlister | None = None) -> None:
         self._numbers = numbers
-        if len(numbers) >= _FEWEST:
-            self._coarse, self._mean = _coarse_copy(numbers)
-        else:
-            self._coarse, self._mean = faiss.IndexFlatIP(numbers.shape[1]), np.zeros(numbers.shape[1], np.float32)
-            self._coarse.add(_vectors_of(numbers))
+        self._shortlister = shortlister or ScannedCopy(numbers)
 
     @classmethod
-    def open(cls, path: Path) -> "ViewIndex":
-        """Map the descriptors into memory and make the coarse copy.
+    def open(cls, path: Path, *, shortlister: Shortlister | None = None) -> "ViewIndex":
+        """Map the descriptors into memory and make the coarse copy, unless something else makes the shortlists.
 
         FAISS is set to one search thread for the calling thread.
 
         Args:
             path: file that ``write_descriptors`` wrote.
+            shortlister: makes the shortlists; None makes a coarse copy for them.
 
         Raises:
             BundleError: the file is not an array of 8-bit numbers with a row per view.
         """
         search_with_one_thread()
-        try:
-            numbers = np.load(path, allow_pickle=False, mmap_mode="r")
-        except (OSError, *NPY_HEADER_ERRORS) as error:
-            raise BundleError(
-                f"{path}: not a valid NPY array ({error}); copy or build the bundle again", field=FILE
-            ) from error
-        if numbers.dtype != np.int8 or numbers.ndim != 2 or not numbers.shape[1] or not numbers.flags["C_CONTIGUOUS"]:
-            raise BundleError(
-                f"{path}: {numbers.dtype} of shape {numbers.shape} instead of int8 with a row per view; copy or build the "
-                "bundle again",
-                field=FILE,
-            )
-        return cls(numbers)
+        return cls(read_descriptors(path), shortlister)
 
     def __len__(self) -> int:
         return len(self._numbers)
@@ -132,21 +183,16 @@ class ViewIndex:
         return int(self._numbers.shape[1])
 
     def shortlist(self, descriptor: Float32[NDArray[np.float32], " D"], k: int) -> Int64[NDArray[np.int64], " k"]:
-        """Return the indices of approximately the k most similar views, in no particular order.
+        """Return the indices of about the k most similar views, in no particular order, perhaps with neighbours.
 
-        The search uses the coarse copy, if the map has one. The caller then compares the listed views exactly with
-        ``vectors``. The list must be several times longer than the number of wanted views (decision 0046).
+        The caller then compares the listed views exactly with ``vectors``. The list must be several times longer than the number of
+        wanted views (decision 0046).
 
         Args:
             descriptor: descriptor of the query view.
             k: length of the list. All views are returned if the index has no more than k.
         """
-        if k >= len(self):
-            return np.arange(len(self))
-        # The coarse copy subtracts the mean from views and queries. Only views may lose it: then a similarity differs from
-        # the exact one by the same constant for all views.
-        found: NDArray[np.int64] = self._coarse.search((descriptor + self._mean)[None], k)[1][0]
-        return found
+        return np.arange(len(self)) if k >= len(self) else self._shortlister.shortlist(descriptor, k)
 
     def vectors(self, views: Int64[NDArray[np.int64], " n"]) -> Descriptors:
         """Return the descriptors of some views, unit vectors.
@@ -154,4 +200,4 @@ class ViewIndex:
         Args:
             views: indices of the views.
         """
-        return _vectors_of(self._numbers[views])
+        return vectors_of(self._numbers[views])

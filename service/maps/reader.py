@@ -14,9 +14,10 @@ from service.geometry.earth import Georeference
 from service.imaging.npy_header import NPY_HEADER_ERRORS
 from service.imaging.view_grid import ViewGrid
 from service.maps import content as parts
-from service.maps import index, streets
+from service.maps import index, inverted_file, streets
 from service.maps.calibration import Calibration, read_calibration
 from service.maps.index import ViewIndex
+from service.maps.inverted_file import InvertedFile
 from service.maps.manifest import Manifest, read_manifest
 from service.maps.streets import Streets
 from service.maps.writer import sha256_of
@@ -68,8 +69,8 @@ class MapBundle:
 
         Args:
             path: the bundle's folder.
-            verify: compare the hash of every file with the manifest, and check every index of the cloud. Sizes and shapes are
-                always checked.
+            verify: compare the hash of every file with the manifest, and check every index of the cloud and of the inverted file.
+                Sizes and shapes are always checked.
 
         Raises:
             BundleError: the bundle is missing, damaged, of another format, or inconsistent. The message names the file and
@@ -85,7 +86,7 @@ class MapBundle:
             rows_seen=np.array(manifest.rows_seen, np.bool_),
             places=_load(path / parts.PLACES_FILE, expected=parts.PLACE),
             views=_load(path / parts.VIEWS_FILE, expected=parts.VIEW),
-            view_index=ViewIndex.open(path / index.FILE),
+            view_index=_view_index(path, manifest, verify=verify),
             streets=None if document is None else Streets.from_geojson(_json_object(document, path / streets.FILE)),
             streets_document=document,
             calibration=read_calibration(_read(path / parts.CALIBRATION_FILE), path=str(path / parts.CALIBRATION_FILE)),
@@ -163,6 +164,19 @@ def _require_files(path: Path, manifest: Manifest, *, verify: bool) -> None:
             raise _defect(file, "the hash does not match the manifest")
     if manifest.files[parts.ENCODER_FILE].sha256 != manifest.encoder_sha256:
         raise _defect(path / parts.ENCODER_FILE, "not the encoder that computed the descriptors")
+
+
+def _view_index(path: Path, manifest: Manifest, *, verify: bool) -> ViewIndex:
+    inverted = None
+    if inverted_file.FILE in manifest.files:
+        inverted = InvertedFile.open(
+            path / inverted_file.FILE,
+            views=manifest.counts.views,
+            dimension=manifest.counts.descriptor_size,
+            headings=manifest.headings,
+            verify=verify,
+        )
+    return ViewIndex.open(path / index.FILE, shortlister=inverted)
 
 
 def _read(path: Path) -> bytes:

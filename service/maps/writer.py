@@ -19,7 +19,7 @@ from pydantic import ValidationError
 
 from service.errors import BundleError
 from service.maps import content as parts
-from service.maps import index, manifest, streets
+from service.maps import index, inverted_file, manifest, streets
 from service.maps.byte_planes import write_records
 from service.maps.content import BundleContent
 from service.maps.manifest import FORMAT, Counts, FileEntry, GridParameters, Manifest
@@ -139,11 +139,19 @@ def _write_files(folder: Path, content: BundleContent) -> Manifest:
         writers[parts.STATISTICS_FILE] = partial(write_records, records=content.statistics)
     for name, array in ({} if content.cloud is None else content.cloud.arrays()).items():
         writers[f"{parts.CLOUD_FOLDER}/{name}.npy"] = _array_writer(array)
+    measured: dict[str, float] = {}
+    if len(content.descriptors) >= inverted_file.SMALLEST:
+
+        def write_index(path: Path) -> None:  # after the descriptors, from which it is made
+            numbers = index.read_descriptors(folder / index.FILE)
+            measured[inverted_file.RECALL] = inverted_file.write_inverted_file(path, numbers, headings=content.headings)
+
+        writers[inverted_file.FILE] = write_index
     for name, write in writers.items():
         write(folder / name)
         _sync(folder / name)
     _sync(folder / parts.CLOUD_FOLDER)
-    made = _manifest_of(folder, content, sorted(writers))
+    made = _manifest_of(folder, content, sorted(writers), measured)
     (folder / manifest.FILE).write_bytes(made.to_bytes())
     _sync(folder / manifest.FILE)
     return made
@@ -157,7 +165,7 @@ def _json(document: object) -> bytes:
     return (json.dumps(document, sort_keys=True, allow_nan=False) + "\n").encode()
 
 
-def _manifest_of(folder: Path, content: BundleContent, names: list[str]) -> Manifest:
+def _manifest_of(folder: Path, content: BundleContent, names: list[str], measured: Mapping[str, float]) -> Manifest:
     files = {name: FileEntry(sha256=sha256_of(folder / name), size=(folder / name).stat().st_size) for name in names}
     try:
         return Manifest(
@@ -169,7 +177,7 @@ def _manifest_of(folder: Path, content: BundleContent, names: list[str]) -> Mani
             headings=content.headings,
             spacing_m=content.spacing_m,
             rows_seen=tuple(bool(seen) for seen in content.rows_seen),
-            parameters=dict(content.parameters),
+            parameters={k: v for k, v in content.parameters.items() if k != inverted_file.RECALL} | dict(measured),
             encoder_sha256=files[parts.ENCODER_FILE].sha256,
             counts=_counts_of(content),
             georeference=None if content.georeference is None else dict(content.georeference),

@@ -1,0 +1,79 @@
+"""``make bench-scale``: search in maps of up to a hundred towns -> reports/scale.json.
+
+The first run simulates two small cities and builds their maps, whose descriptors it keeps. A hundred towns need 5 GB of memory and
+2 GB of disk.
+"""
+
+import argparse
+import sys
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from benchmarks.report import ROOT, Report
+from benchmarks.runs import SIMULATION, Runs, code_hash
+from benchmarks.scale.drawn import DrawnViews
+from benchmarks.scale.search import SIZES, search_rows
+from benchmarks.scale.sources import RealDescriptors, real_descriptors
+from model_training.stock import ENCODER
+from service.maps.index import vectors_of
+from service.retrieval.encoder import Encoder
+
+#: Code that determines the real descriptors.
+_DESCRIBING = (*SIMULATION, "service/imaging", "benchmarks/scale/sources.py", "model_training/mapping/places.py")
+
+
+def kept_descriptors(work: Path) -> RealDescriptors:
+    """Return the real descriptors of the stock encoder, kept ones if there are any.
+
+    Args:
+        work: folder of datasets, maps and kept descriptors.
+    """
+    path = work / f"real-{code_hash(*_DESCRIBING)}-{Encoder.open(ENCODER).sha256[:12]}.npz"
+    if not path.exists():
+        real_descriptors(Runs(work, ENCODER)).save(path)
+    return RealDescriptors.load(path)
+
+
+def _similarity(queries: NDArray[np.float32], views: NDArray[np.float32]) -> float:
+    """Return the median similarity of queries (Q, T, D) and views (Q, D), each at its best turn."""
+    return float(np.median(np.einsum("qtd,qd->qt", queries, views).max(axis=1)))
+
+
+def main() -> None:
+    """Parse the arguments, measure and write the report."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument(
+        "--work", type=Path, default=ROOT / "data" / "scale", help="folder of datasets, maps and index files"
+    )
+    parser.add_argument(
+        "--sizes",
+        nargs="+",
+        type=int,
+        default=SIZES,
+        help="numbers of views, 10,000 or more; the rows of other sizes stay",
+    )
+    arguments = parser.parse_args()
+    if min(arguments.sizes) < 10_000:
+        parser.error(f"--sizes: {min(arguments.sizes)} is too small; give 10000 or more")
+    arguments.work.mkdir(parents=True, exist_ok=True)
+    told = " ".join(sys.argv[1:])
+    report = Report("scale", "make bench-scale" + (f' ARGS="{told}"' if told else ""))
+    if tuple(arguments.sizes) != SIZES:
+        report.keep_others()
+    real = kept_descriptors(arguments.work)
+    whole = DrawnViews(real, len(real.views))
+    asked = whole.queries(1_000)
+    own = _similarity(real.queries, real.views[real.true_view])
+    drawn = _similarity(asked.descriptors, vectors_of(whole[asked.true_view]))
+    report.notes["maps"] = (
+        f"Maps are drawn from {len(real.views)} real views and {len(real.queries)} real queries of simulated cities "
+        "(`benchmarks/scale/drawn.py`). The similarity of a query to its own view is "
+        f"{own:.3f} in these cities and {drawn:.3f} in drawn maps (median, best of three turns). Times are processor times of one thread."
+    )
+    search_rows(report, real, arguments.work, tuple(sorted(arguments.sizes)))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,344 @@
+"""The index of a large map: an inverted file of short codes. It makes the shortlist without a scan of all views.
+
+FAISS groups the views by their nearest centroid, and a search reads only the groups near the query. A graph (HNSW) over the centroids
+finds these groups. The code of a view is its difference from the centroid, and takes four bits per axis. The neighbours of the best views
+along the survey complete the shortlist. Decision 0158 has the figures.
+"""
+
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, Protocol, runtime_checkable
+
+import faiss
+import numpy as np
+from jaxtyping import Float32, Int64
+from numpy.typing import NDArray
+
+from service.errors import BundleError
+from service.maps import index
+from service.maps.index import Shortlister, vectors_of
+
+FILE = "search.faiss"
+#: Smallest number of views for this file. For fewer, a scan is exact and takes at most 1 ms longer (decision 0158).
+SMALLEST = 1_000_000
+#: Parameter of the manifest: recall@10 of the index against exact search, as measured when it was built.
+RECALL = "search_recall_at_10"
+#: Number of principal axes. A map with fewer components has fewer.
+_AXES = 48
+#: Share of the views on either side that the range of a code leaves out. Rare values would make its steps too large.
+_OUTLIERS = 0.005
+#: Neighbours of a centroid in the graph.
+_LINKS = 32
+#: Fewest candidates of a search in the graph. More find nearer centroids and take longer.
+_LEAST_CANDIDATES = 64
+#: The best third of the views that the codes list brings its neighbours: views of so many places before and after it in the survey,
+#: at headings so far away.
+_BRING, _PLACES, _TURNS = 3, 2, 1
+#: Steps of k-means, and views for each centroid that it takes into account.
+_STEPS, _VIEWS_PER_LIST = 6, 16
+#: Smallest number of views that determine axes and ranges.
+_SAMPLE = 65_536
+#: Views that are read at once.
+_CHUNK = 16_384
+#: Queries that measure recall, views that each of them lists, and best views of these that count.
+_QUERIES, _LISTED, _BEST = 128, 1_440, 10
+#: Noise of these queries: the share of a difference between two views of the map that is added to a view.
+_NOISE = 0.6
+#: Recall to reach, and factor by which the number of lists that a search reads grows until then.
+_WANTED, _GROWTH = 0.992, 2**0.5
+_REMEDY = "copy or build the bundle again"
+_Asked = Float32[NDArray[np.float32], "q D"]
+#: FAISS without its type stubs, which lack many of the classes and fields that this file uses.
+_faiss: Any = faiss
+
+
+@runtime_checkable
+class Rows(Protocol):
+    """The 8-bit descriptors of all views, a row per view: an array, or something that computes the rows that are read."""
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """Number of views, and number of components."""
+
+    def __len__(self) -> int:
+        """Return the number of views."""
+
+    def __getitem__(self, views: Any, /) -> NDArray[np.int8]:
+        """Return the rows of some views.
+
+        Args:
+            views: a slice, or the numbers of the views.
+        """
+
+
+def write_inverted_file(path: Path, numbers: Rows, *, headings: int) -> float:
+    """Build the index of a map and write it; return its recall@10 against exact search.
+
+    The same descriptors give the same bytes on processors of one kind, for any number of threads.
+
+    Args:
+        path: the new file.
+        numbers: 8-bit descriptors, a row per view, as ``write_descriptors`` stores them. Places follow each other as in the survey.
+        headings: number of views per place.
+    """
+    with _threads(1):
+        whole = _trained(numbers)
+        _add(whole, numbers)
+        recall = _choose_probes(whole, numbers, headings)
+        _faiss.write_index(whole, str(path))
+    return recall
+
+
+def lists_for(views: int) -> int:
+    """Return the number of lists of an index: the power of two next to eight times the root of the number of views.
+
+    Args:
+        views: number of views, 1 or more.
+    """
+    return int(2 ** max(0, round(np.log2(8 * np.sqrt(views)))))
+
+
+class InvertedFile:
+    """Open index of a large map. Several threads may search it at the same time.
+
+    Args:
+        whole: principal axes and inverted file.
+        headings: number of views per place.
+    """
+
+    def __init__(self, whole: Any, headings: int) -> None:
+        self._headings = headings
+        self._whole = whole  # keeps the parts below alive
+        self._axes = _faiss.downcast_VectorTransform(whole.chain.at(0))
+        self._lists = _faiss.downcast_index(whole.index)
+
+    @classmethod
+    def open(cls, path: Path, *, views: int, dimension: int, headings: int, verify: bool = True) -> "InvertedFile":
+        """Map the index into memory.
+
+        Args:
+            path: file that ``write_inverted_file`` wrote.
+            views: number of views of the map.
+            dimension: number of components of a descriptor.
+            headings: number of views per place.
+            verify: check that the lists hold every view once, and that the graph refers to its own centroids.
+
+        Raises:
+            BundleError: the file is damaged, or belongs to another map.
+        """
+        index.search_with_one_thread()
+        try:
+            whole = _faiss.read_index(str(path), _faiss.IO_FLAG_MMAP | _faiss.IO_FLAG_READ_ONLY)
+        except RuntimeError as error:
+            reason = str(error).splitlines()[0].rpartition("Error: ")[2]
+            raise _defect(path, f"not a valid FAISS index ({reason})") from error
+        wrong = _unlike(whole, views, dimension, path.stat().st_size)
+        if not wrong and verify:
+            wrong = _inconsistent(_faiss.downcast_index(whole.index))
+        if wrong:
+            raise _defect(path, wrong)
+        # FAISS would start 32 threads for each search, which read the lists in advance (2 ms).
+        _faiss.downcast_InvertedLists(_faiss.downcast_index(whole.index).invlists).prefetch_nthread = 0
+        return cls(whole, headings)
+
+    @property
+    def lists(self) -> int:
+        """Number of lists."""
+        return int(self._lists.nlist)
+
+    @property
+    def probes(self) -> int:
+        """Number of lists that a search reads at least."""
+        return int(self._lists.nprobe)
+
+    def shortlist(self, descriptor: Float32[NDArray[np.float32], " D"], k: int) -> Int64[NDArray[np.int64], " n"]:
+        """Return the indices of about the k most similar views and of neighbours of the best third, ascending.
+
+        Args:
+            descriptor: descriptor of the query view.
+            k: length of the list, at most the number of views.
+        """
+        found = self._by_codes(descriptor, k)
+        return np.union1d(found, self._neighbours(found[: -(-k // _BRING)]))
+
+    def _by_codes(self, descriptor: Float32[NDArray[np.float32], " D"], k: int) -> Int64[NDArray[np.int64], " n"]:
+        """Return the k most similar views by their codes, the best first. Fewer only if the graph does not lead to all lists."""
+        asked, probes = self._axes.apply(descriptor[None]), self.probes
+        while True:
+            # The graph finds the nearest centroids only if it keeps as many candidates as it shall return.
+            graph = _faiss.SearchParametersHNSW(efSearch=max(probes, _LEAST_CANDIDATES))
+            reading = _faiss.SearchParametersIVF(nprobe=probes, quantizer_params=graph)
+            found: NDArray[np.int64] = self._lists.search(asked, k, params=reading)[1][0]
+            found = found[found >= 0]
+            if len(found) == k or probes >= self.lists:
+                return found
+            probes *= 2  # these lists have fewer than k views
+
+    def _neighbours(self, views: Int64[NDArray[np.int64], " n"]) -> Int64[NDArray[np.int64], " m"]:
+        """Return views around some views: of places next to theirs in the survey, at headings next to theirs."""
+        place, heading = np.divmod(views, self._headings)
+        turned = (heading[:, None] + np.arange(-_TURNS, _TURNS + 1)) % self._headings
+        along = place[:, None] + np.arange(-_PLACES, _PLACES + 1)
+        around = (along[:, :, None] * self._headings + turned[:, None, :]).ravel()
+        inside: NDArray[np.int64] = around[(around >= 0) & (around < self._lists.ntotal)]
+        return inside
+
+
+@contextmanager
+def _threads(count: int) -> Iterator[None]:
+    """Make FAISS use some threads. With more than one, the graph and the rounding of sums depend on them, but no search does."""
+    before = _faiss.omp_get_max_threads()
+    _faiss.omp_set_num_threads(count)
+    try:
+        yield
+    finally:
+        _faiss.omp_set_num_threads(before)
+
+
+def _trained(numbers: Rows) -> Any:
+    """Return an index with axes, centroids and codes, but without views."""
+    size, lists = numbers.shape[1], lists_for(len(numbers))
+    name = f"PCA{min(_AXES, size)},IVF{lists}_HNSW{_LINKS},SQ4"
+    whole = _faiss.index_factory(size, name, _faiss.METRIC_INNER_PRODUCT)
+    axes, inverted = _faiss.downcast_VectorTransform(whole.chain.at(0)), _faiss.downcast_index(whole.index)
+    settings = inverted.cp
+    settings.niter, settings.max_points_per_centroid, settings.min_points_per_centroid = _STEPS, _VIEWS_PER_LIST, 1
+    inverted.sq.rangestat, inverted.sq.rangestat_arg = _faiss.ScalarQuantizer.RS_quantiles, _OUTLIERS
+    # The graph finds the nearest centroid of a view without a comparison with all centroids.
+    graph = _faiss.IndexHNSWFlat(inverted.d, _LINKS, _faiss.METRIC_INNER_PRODUCT)
+    inverted.clustering_index = graph
+    count = min(len(numbers), max(_SAMPLE, _VIEWS_PER_LIST * lists))
+    # Drawn at random, because views at equal distances may all have one heading.
+    rows = np.random.default_rng(0).choice(len(numbers), count, replace=False)
+    sample = vectors_of(numbers[np.sort(rows)])
+    # With their opposites the views have a mean of zero. So the axes keep the length of a view, and spherical centroids fit.
+    some = sample[:: -(-len(sample) // _SAMPLE)]
+    axes.train(np.concatenate([some, -some]))
+    inverted.train(axes.apply(sample))
+    inverted.clustering_index = None  # the graph ends with this function
+    whole.is_trained = True
+    return whole
+
+
+def _add(whole: Any, numbers: Rows) -> None:
+    """Add all views in their order. Lists and codes of a view do not depend on the number of threads."""
+    axes, inverted = _faiss.downcast_VectorTransform(whole.chain.at(0)), _faiss.downcast_index(whole.index)
+    for first in range(0, len(numbers), _CHUNK):
+        along = axes.apply(vectors_of(numbers[first : first + _CHUNK]))
+        with _threads(os.cpu_count() or 1):
+            inverted.add(along)
+    whole.ntotal = inverted.ntotal
+
+
+def _choose_probes(whole: Any, numbers: Rows, headings: int) -> float:
+    """Set about the smallest number of probes that reaches the recall wanted; return the recall.
+
+    Args:
+        whole: index of all views.
+        numbers: their descriptors.
+        headings: number of views per place.
+    """
+    asked = _queries(numbers)
+    tenth = _tenth_best(numbers, asked)
+    inverted, opened = _faiss.downcast_index(whole.index), InvertedFile(whole, headings)
+    probes = 1.0
+    while True:
+        inverted.nprobe = min(round(probes), inverted.nlist)
+        recall = recall_of(opened, numbers, asked, tenth)
+        if recall >= _WANTED or inverted.nprobe == inverted.nlist:
+            return recall
+        probes *= _GROWTH
+
+
+def recall_of(opened: Shortlister, numbers: Rows, asked: _Asked, tenth: NDArray[np.float32]) -> float:
+    """Return the share of the ten most similar views that the shortlist has, mean over all queries.
+
+    Views as similar as the tenth count as much as the tenth.
+
+    Args:
+        opened: the index.
+        numbers: descriptors of all views.
+        asked: descriptors of the queries.
+        tenth: similarity of each query's tenth best view.
+    """
+    best, listed = min(_BEST, len(numbers)), min(_LISTED, len(numbers))
+    found = 0
+    for query, least in zip(asked, tenth, strict=True):
+        similarity = vectors_of(numbers[opened.shortlist(query, listed)]) @ query
+        found += min(best, int((similarity >= least - 1e-6).sum()))
+    return found / (best * len(asked))
+
+
+def _queries(numbers: Rows) -> _Asked:
+    """Return views with the noise of two views of one place. Its spectrum is that of the map's own descriptors."""
+    rng = np.random.default_rng(0)
+    count = min(_QUERIES, len(numbers))
+    view, one, other = (vectors_of(numbers[np.sort(rng.integers(len(numbers), size=count))]) for _ in range(3))
+    noisy = view + _NOISE * (one - rng.permutation(other))
+    asked: _Asked = noisy / np.maximum(np.linalg.norm(noisy, axis=1, keepdims=True), 1e-12)
+    return asked
+
+
+def _tenth_best(numbers: Rows, asked: _Asked) -> Float32[NDArray[np.float32], " q"]:
+    """Return the similarity of the tenth best view of each query by exact search, or of the last one of fewer views."""
+    kept = np.full((len(asked), min(_BEST, len(numbers))), -np.inf, np.float32)
+    for first in range(0, len(numbers), _CHUNK):
+        similar = asked @ vectors_of(numbers[first : first + _CHUNK]).T
+        least = kept.min(axis=1, keepdims=True)
+        for query in np.flatnonzero((similar > least).any(axis=1)):
+            both = np.concatenate([kept[query], similar[query][similar[query] > least[query]]])
+            kept[query] = -np.partition(-both, kept.shape[1] - 1)[: kept.shape[1]]
+    tenth: NDArray[np.float32] = kept.min(axis=1)
+    return tenth
+
+
+def _unlike(whole: Any, views: int, dimension: int, size: int) -> str:
+    """Return how an index differs from that of a map; empty if it fits."""
+    if not isinstance(whole, _faiss.IndexPreTransform) or whole.chain.size() != 1:
+        return f"{type(whole).__name__} instead of principal axes with an inverted file"
+    axes, inverted = _faiss.downcast_VectorTransform(whole.chain.at(0)), _faiss.downcast_index(whole.index)
+    if not isinstance(axes, _faiss.PCAMatrix) or not isinstance(inverted, _faiss.IndexIVFScalarQuantizer):
+        return f"{type(axes).__name__} and {type(inverted).__name__} instead of PCAMatrix and IndexIVFScalarQuantizer"
+    graph, lists = _faiss.downcast_index(inverted.quantizer), _faiss.downcast_InvertedLists(inverted.invlists)
+    if not isinstance(graph, _faiss.IndexHNSWFlat) or not isinstance(lists, _faiss.OnDiskInvertedLists):
+        return f"{type(graph).__name__} and {type(lists).__name__} instead of IndexHNSWFlat and OnDiskInvertedLists"
+    if inverted.ntotal != views or lists.compute_ntotal() != views:
+        return f"{inverted.ntotal} views in its head and {lists.compute_ntotal()} in its lists instead of {views}"
+    if whole.d != dimension or axes.d_out != inverted.d or graph.d != inverted.d:
+        return f"descriptors of {whole.d} numbers instead of {dimension}, or parts that do not fit together"
+    if graph.ntotal != inverted.nlist or not 1 <= inverted.nprobe <= inverted.nlist:
+        return f"{graph.ntotal} centroids and {inverted.nprobe} probes for {inverted.nlist} lists"
+    last = lists.lists.at(inverted.nlist - 1)
+    if (
+        inverted.sq.qtype != _faiss.ScalarQuantizer.QT_4bit
+        or inverted.code_size != (inverted.d + 1) // 2
+        or last.offset + last.size * (inverted.code_size + 8) > size
+    ):
+        return "the codes do not fit into the file"
+    return ""
+
+
+def _inconsistent(inverted: Any) -> str:
+    """Return which reference of an index leads nowhere; empty if there is none."""
+    lists, seen = _faiss.downcast_InvertedLists(inverted.invlists), np.zeros(inverted.ntotal, np.bool_)
+    for number in range(inverted.nlist):
+        count = lists.list_size(number)
+        if not count:
+            continue
+        views: NDArray[np.int64] = _faiss.rev_swig_ptr(lists.get_ids(number), count)
+        if views.min() < 0 or views.max() >= len(seen):
+            return f"list {number} refers to a missing view"
+        seen[views] = True
+    if not seen.all():
+        return f"{int((~seen).sum())} views are in no list"
+    graph = _faiss.downcast_index(inverted.quantizer).hnsw
+    neighbours = _faiss.vector_to_array(graph.neighbors)
+    if len(neighbours) and not -1 <= neighbours.min() <= neighbours.max() < inverted.nlist:
+        return "the graph refers to a missing centroid"
+    return ""
+
+
+def _defect(path: Path, what: str) -> BundleError:
+    return BundleError(f"{path}: {what}; {_REMEDY}", field=FILE)
