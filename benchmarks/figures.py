@@ -18,6 +18,7 @@ from benchmarks.provenance import ROOT
 from model_training.stock import CALIBRATION
 from service.maps.calibration import Calibration, read_calibration
 from service.option_limits import FALSE_ACCEPT_RATE, SAFE_CONFIDENCE
+from service.scoring.support import SupportWeights
 
 REPORTS = ROOT / "reports"
 _FIGURE = re.compile(r"(<!-- figure: (\S+) (\S+) (\S+) -->)(.*?)(<!-- /figure -->)", re.DOTALL)
@@ -39,6 +40,7 @@ def stock_calibration() -> Calibration:
 CODE: dict[str, Callable[[], float]] = {
     "false_accept_rate": lambda: FALSE_ACCEPT_RATE,
     "safe_confidence": lambda: SAFE_CONFIDENCE,
+    "structure_gap": lambda: SupportWeights().structure_gap,
     "least_false_accept_rate": lambda: stock_calibration().least_false_accept_rate,
     "localized_from_confidence": lambda: stock_calibration().threshold(FALSE_ACCEPT_RATE),
 }

@@ -137,7 +137,7 @@ class Feature:
 #: ``log_share`` has no weight, because it is a separate rule beside the confidence (``service.confidence.decision``, decision
 #: 0086). ``similarity`` has none, because it depends more on the kind of street than on the place. Real streets lie four
 #: standard deviations below simulated streets (decision 0137). The others without a weight gained nothing on rig families that
-#: were left out of the fit (decision 0149). They still serve ``reasons``.
+#: were left out of the fit (decisions 0149 and 0159). They still serve ``reasons``.
 TABLE: tuple[Feature, ...] = (
     Feature("margin", "nat", "support gap to the best rival", 1,
             lambda e: float(e.support_gaps[1:].min(initial=_MOST_MARGIN)), rivalry=True, ideal=True),
@@ -154,6 +154,12 @@ TABLE: tuple[Feature, ...] = (
             lambda e: e.best.scores["through"] / e.mapped_share, ideal=True),
     Feature("front", "1", "share of the mapped points in front of the map's surfaces", -1,
             lambda e: e.best.scores["front"] / e.mapped_share, ideal=True),
+    Feature("shared_edges", "1", "share of the depth edges of image and map that the other one has too", 1,
+            lambda e: e.best.scores["shared_edges"], weighted=False),
+    Feature("upper_inliers", "1", "share of the points above vehicles and people that lie on the map", 1,
+            lambda e: e.best.scores["upper_inliers"], ideal=True),
+    Feature("contrast", "1", "how much worse the depth fits if the map's image shifts by a few degrees", 1,
+            lambda e: e.best.scores["contrast"], ideal=True),
     Feature("unmapped", "1", "share of the points where the map shows nothing", -1, lambda e: e.best.scores["unmapped"],
             weighted=False),
     Feature("log_sigma", "log m", "larger horizontal standard deviation of the registration", -1,

@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float32, Float64
 from numpy.typing import NDArray
 
-from service.confidence.features import FEATURES
+from service.confidence.features import FEATURES, IDEALS
 from service.imaging.depth_unit_hint import unit_hint
 from service.maps.calibration import Calibration
 from service.scoring.support import SupportWeights
@@ -48,7 +48,8 @@ GROUPS: tuple[tuple[str, tuple[str, ...], str], ...] = (
     ),
     ("baseline", ("log_noise", "points", "log_sigma"), "check the stereo baseline (depth.baseline_m) and the noise of the depth"),
     (
-        "traffic in the map", ("through", "front", "mapped_inliers", "inliers", "unmapped", "likelihood"),
+        "traffic in the map",
+        ("through", "front", "mapped_inliers", "inliers", "upper_inliers", "shared_edges", "contrast", "unmapped", "likelihood"),
         "build the map with the traffic vote, and look for changes since the survey",
     ),
     (
@@ -67,6 +68,8 @@ def reasons_of(
     depth_m: Float32[NDArray[np.float32], "h w"] | None = None,
 ) -> tuple[Reason, ...]:
     """List what to check, the likeliest cause first; empty if all confidence features are in range and the depth is plausible.
+
+    A feature that is better than the calibration data is no reason, for example an unusually large share of inliers.
 
     Args:
         calibration: calibration of the map.
@@ -87,7 +90,7 @@ def _by_evidence(calibration: Calibration, evidence: Float64[NDArray[np.float64]
     found = []
     for check, names, remedy in GROUPS:
         deviations = ((name, float(away[FEATURES.index(name)])) for name in names)
-        far = tuple((name, size) for name, size in deviations if abs(size) > FAR)
+        far = tuple((name, size) for name, size in deviations if abs(size) > FAR and size * IDEALS.get(name, 0) <= 0)
         if far:
             found.append(Reason(check, far, remedy))
     return tuple(found)

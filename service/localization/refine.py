@@ -13,9 +13,9 @@ from service.registration.covariance import (
     OF_RAYS,
     covariance_of,
     disagreement,
+    map_covariance,
     rectification_covariance,
     score_outer_product,
-    survey_covariance,
 )
 from service.registration.local_search import LocalSearchSettings, search_locally
 from service.registration.points import FOCAL_BASELINE_PX_M, PointSettings
@@ -30,6 +30,7 @@ from service.scoring.candidates import Candidate, Refined
 from service.scoring.measured import MeasuredFrame, measure, merged_points
 from service.scoring.photometry import BrightnessScorer, PhotometrySettings
 from service.scoring.similarity import similarity_of
+from service.scoring.structure import StructureScorer
 from service.scoring.support import LocalScoreWeights, PoseScorer, SupportWeights, scorers_of
 
 
@@ -129,11 +130,12 @@ def refine(
     scorer = PoseScorer(
         measured,
         scorers_of(bundle, cloud, measured, prior, settings.support),
+        StructureScorer(cloud, measured, settings.support.structure),
         BrightnessScorer(raycaster, measured, settings.photometry),
         settings.support,
         settings.near,
     )
-    candidates = scorer.with_brightness(scorer.candidates(found))
+    candidates = scorer.with_details(scorer.candidates(found))
     independent = float(np.median([frame.independent_noise for frame in frames]))
     if scorer.brightness.is_known and independent >= settings.around.from_noise:
         near = search_locally(
@@ -152,7 +154,7 @@ def refine(
     noise = float(np.median([frame.noise for frame in frames]))
     heading = heading_of_camera(candidates[0].T_map_camera)
     of_registration = covariance_of(best.information, scatter, noise, heading, model)
-    systematic = survey_covariance(*bundle.manifest.survey_std)
+    systematic = map_covariance(*bundle.manifest.survey_std)
     if reference.query.baseline_m is not None:
         systematic = systematic + rectification_covariance(reference.views.height_m, reference.query.baseline_m)
     candidates[0] = replace(candidates[0], covariance=of_registration + systematic)

@@ -23,7 +23,8 @@ class Candidate:
         T_map_camera: pose of the reference camera.
         registered: result of the solver. For the best candidate the ray adjustment then moves the pose by centimetres. Its
             scores below come from before this adjustment.
-        scores: scores of all scorers and their details, by name. ``brightness`` is missing if it was not computed.
+        scores: scores of all scorers and their details, by name. ``structure``, its details and
+            ``brightness`` are missing if they were not computed. The best candidate always has its structure.
         support: weighted sum of the scores, in nats; only differences between candidates have a meaning.
         covariance: of ``T_map_camera``, if the candidate is right: translation (m), then rotation (rad), in map axes, about the
             camera. None if not computed.
@@ -43,7 +44,7 @@ class Refined:
     Attributes:
         candidates: registered poses, the best supported first.
         covariance: of the best candidate: translation (m), then rotation (rad), in map axes, about the camera.
-        registration_covariance: the part of it without the errors of the survey and of a stereo pair's rectification.
+        registration_covariance: the part of it without the errors of the map and of a stereo pair's rectification.
         points: number of registered points, over all frames.
         disagreement: variance inflation at the best pose: how much the image patches disagree about it, relative to their noise.
         covariance_at: function that computes the covariance of a candidate without ray adjustment: of every one but the best.

@@ -1,7 +1,7 @@
 """The support of a pose: the weighted sum of its scores. ``scorers_of`` lists the scorers."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -19,13 +19,15 @@ from service.scoring.prior import PriorScorer
 from service.scoring.rendered_depth import RenderedDepthScorer
 from service.scoring.scorer import Scorer
 from service.scoring.similarity import SimilarityScorer
+from service.scoring.structure import StructureScorer, StructureWeights
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SupportWeights:
     """Weights of the support of a candidate, in nats per unit of each score.
 
-    Fitted by a conditional logit over the candidates of queries in the validation cities (decisions 0028, 0082 and 0100).
+    Fitted by a conditional logit over the candidates of queries, in validation cities (decisions 0028, 0082 and 0100). Training cities
+    gave the weights of the structure (decision 0159).
 
     Attributes:
         inliers: weight of the share of inliers.
@@ -34,6 +36,8 @@ class SupportWeights:
         prior: weight of the log weight of the prior, which is in nats already.
         brightness: weight of the agreement with the map's brightness.
         brightness_gap: largest support gap to the best candidate at which brightness is computed, nats. Rendering takes time.
+        structure: weights of the depth structure.
+        structure_gap: the same gap for the depth structure.
     """
 
     inliers: float = 20.0
@@ -42,6 +46,19 @@ class SupportWeights:
     prior: float = 1.0
     brightness: float = 80.0
     brightness_gap: float = 4.0
+    structure: StructureWeights = field(default_factory=StructureWeights)
+    structure_gap: float = 8.0
+
+    def __post_init__(self) -> None:
+        """Check that every candidate with a brightness has a structure, so that the best one always has it.
+
+        Raises:
+            ValueError: ``brightness_gap`` exceeds ``structure_gap``.
+        """
+        if self.brightness_gap > self.structure_gap:
+            raise ValueError(
+                f"brightness_gap: {self.brightness_gap:g} must be at most structure_gap ({self.structure_gap:g})"
+            )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -75,7 +92,7 @@ def scorers_of(
 ) -> tuple[Weighted, ...]:
     """Return the scorers that rate every candidate of a query, each with its weight. A new scorer is one more line.
 
-    Brightness is not among them: ``PoseScorer.with_brightness`` adds it for the leading candidates only.
+    Depth structure and brightness are not among them: ``PoseScorer.with_details`` adds them for the leading candidates only.
 
     Args:
         bundle: the map.
@@ -99,19 +116,21 @@ class PoseScorer:
     Attributes:
         measured: frames of the query, the reference first.
         scorers: scorers that rate every pose, with their weights.
-        brightness: scorer that rates the leading poses.
+        structure: scorer that rates the leading poses.
+        brightness: another scorer that rates the leading poses.
         weights: weights of the support.
         near: weights for the choice among poses about a metre apart.
     """
 
     measured: tuple[MeasuredFrame, ...]
     scorers: tuple[Weighted, ...]
+    structure: StructureScorer
     brightness: BrightnessScorer
     weights: SupportWeights
     near: LocalScoreWeights
 
     def candidates(self, found: tuple[Registered, ...]) -> list[Candidate]:
-        """Score poses without brightness; return them with the best supported first.
+        """Score poses without depth structure and brightness; return them with the best supported first.
 
         Args:
             found: registered poses of the reference's level frame.
@@ -128,31 +147,19 @@ class PoseScorer:
             candidates.append(Candidate(T_map_camera, pose, own_scores, self._support(own_scores)))
         return sorted(candidates, key=lambda candidate: -candidate.support)
 
-    def with_brightness(self, candidates: list[Candidate]) -> list[Candidate]:
-        """Add brightness to the support of the leading candidates; return all candidates, the best supported first.
+    def with_details(self, candidates: list[Candidate]) -> list[Candidate]:
+        """Add depth structure and brightness to the support; return all candidates, the best supported first.
 
-        Only candidates within ``weights.behind`` of the best are compared, because rendering takes time. The others get the
-        lowest brightness score of these. So each of them stays at least as far behind the leading ones as before.
-        The candidates stay as they are if the map has no brightness or only one candidate leads.
+        Both render the map, which takes time. So only candidates whose support is near that of the best are compared. The best one
+        always has its structure, for the confidence. Brightness is left out if the map has none, or if only one candidate leads.
 
         Args:
-            candidates: candidates without brightness, the best supported first.
+            candidates: candidates as ``candidates`` returns them, the best supported first.
         """
-        leading = [each for each in candidates if each.support >= candidates[0].support - self.weights.brightness_gap]
-        if not self.brightness.is_known or len(leading) == 1:
+        candidates = _rescored(candidates, self.structure, 1.0, self.weights.structure_gap)
+        if not self.brightness.is_known or len(_leading(candidates, self.weights.brightness_gap)) == 1:
             return candidates
-        scores = self.brightness.score(tuple(each.registered for each in leading)).values.tolist()
-        rescored = [
-            replace(
-                each,
-                support=each.support + self.weights.brightness * score,
-                scores={**each.scores, self.brightness.name: score},
-            )
-            for each, score in zip(leading, scores, strict=True)
-        ]
-        least = self.weights.brightness * min(scores)
-        rescored += [replace(each, support=each.support + least) for each in candidates[len(leading) :]]
-        return sorted(rescored, key=lambda candidate: -candidate.support)
+        return _rescored(candidates, self.brightness, self.weights.brightness, self.weights.brightness_gap)
 
     def select_local_optimum(self, best: Candidate, near: list[LocalPose]) -> Candidate:
         """Choose the best of several poses near a candidate.
@@ -175,16 +182,42 @@ class PoseScorer:
         chosen = int(np.argmax(totals))
         if chosen == 0:
             return best
-        (moved,) = self.candidates((near[chosen].pose,))
-        gained = moved.support - self._support(best.scores)
+        (moved,) = _rescored(self.candidates((near[chosen].pose,)), self.structure, 1.0, 0.0)
+        gained = moved.support - self._support(best.scores) - best.scores[self.structure.name]
         gained += self.weights.brightness * (brightness[chosen] - brightness[0])
         return replace(
             moved, support=best.support + max(gained, 0.0), scores={**moved.scores, name: brightness[chosen]}
         )
 
     def _support(self, scores: Mapping[str, float]) -> float:
-        """Compute the support of a pose without brightness, nats."""
+        """Compute the support of a pose without depth structure and brightness, nats."""
         support = 0.0
         for scorer, weight in self.scorers:
             support += weight * scores[scorer.name]
         return support
+
+
+def _leading(candidates: list[Candidate], gap: float) -> list[Candidate]:
+    """Return the candidates whose support is within ``gap`` (nats) of the best; the list has the best supported first."""
+    return [each for each in candidates if each.support >= candidates[0].support - gap]
+
+
+def _rescored(candidates: list[Candidate], scorer: Scorer, weight: float, gap: float) -> list[Candidate]:
+    """Add a score to the leading candidates; return all, the best supported first.
+
+    The others get the lowest score of the leading ones. So each of them stays at least as far behind these as before.
+    """
+    leading = _leading(candidates, gap)
+    found = scorer.score(tuple(each.registered for each in leading))
+    scores = {scorer.name: found.values.tolist(), **{name: values.tolist() for name, values in found.details.items()}}
+    rescored = [
+        replace(
+            each,
+            support=each.support + weight * scores[scorer.name][k],
+            scores={**each.scores, **{name: values[k] for name, values in scores.items()}},
+        )
+        for k, each in enumerate(leading)
+    ]
+    least = weight * min(scores[scorer.name])
+    rescored += [replace(each, support=each.support + least) for each in candidates[len(leading) :]]
+    return sorted(rescored, key=lambda candidate: -candidate.support)

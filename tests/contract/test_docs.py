@@ -173,6 +173,7 @@ def test_how_it_works_tells_the_numbers_that_are_set() -> None:
     """Settings change, and so must the page that tells of them."""
     told = " ".join(re.sub(r"<!-- .*? -->", "", (ROOT / "docs" / "how_it_works.md").read_text()).split())
     registration, support = RegistrationSettings(), SupportWeights()
+    structure = support.structure
     words = {5: "five", 6: "six", 8: "eight", 10: "ten", 11: "eleven"}
     for text in (
         f"Up to {StartSettings().most} hypotheses with {words[len(registration.offsets_m)]} starts each",
@@ -180,6 +181,7 @@ def test_how_it_works_tells_the_numbers_that_are_set() -> None:
         f"a middle one of {registration.middle_points}, the {words[registration.refined]} most promising",
         f"thinned to {PointSettings().points:,} points",
         f"{support.inliers:g} inliers + {support.similarity:g} similarity + {support.likelihood:g} log likelihood",
+        f"{structure.shared_edges:g} shared edges + {structure.upper_inliers:g} upper inliers + {structure.contrast:g} contrast",
         f"exp((s_v - s_max) / {ClusterSettings().temperature:g})",
         f"{100 * FALSE_ACCEPT_RATE:g} % by default",
     ):

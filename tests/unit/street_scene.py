@@ -194,6 +194,7 @@ def candidate():
         registered = Registered(R, np.array(xyz, np.float64), scale, 0.0, 0.7, np.eye(8), 0)
         T_map_camera = transform_from(R @ R_BODY_OPTICAL, np.array(xyz, np.float64))
         scores = {"similarity": 0.8, "place_m": 1.5, "likelihood": -1.5, "through": 0.02, "front": 0.2, "unmapped": 0.1}
+        scores |= {"structure": 12.0, "shared_edges": 0.3, "upper_inliers": 0.7, "contrast": 0.2}
         return Candidate(T_map_camera, registered, scores, support)
 
     return made

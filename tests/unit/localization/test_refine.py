@@ -7,7 +7,7 @@ from service.geometry.camera import PinholeCamera
 from service.geometry.rigid import R_BODY_OPTICAL, heading_of_camera, inverse, rotation_y, rotation_z, transform_from
 from service.localization import refine as refining
 from service.localization.refine import RefineSettings, refine, settings_for_rig
-from service.registration.covariance import OF_POINTS, OF_RAYS, covariance_of, score_outer_product
+from service.registration.covariance import OF_POINTS, OF_RAYS, covariance_of, map_covariance, score_outer_product
 from service.registration.local_search import LocalPose
 from service.registration.points import PointSettings, inverse_depth_noise
 from service.registration.rays import RaySettings, adjust
@@ -20,6 +20,7 @@ from service.scoring.measured import measure
 from service.scoring.photometry import BrightnessScorer
 from service.scoring.scorer import Scores
 from service.scoring.similarity import similarity_of
+from service.scoring.structure import StructureWeights
 from service.scoring.support import LocalScoreWeights, SupportWeights
 
 CAMERA = PinholeCamera(80, 60, 50.0, 50.0, 39.5, 29.5)
@@ -105,8 +106,11 @@ def always_refined(bundle, cloud, frames, prior, settings):
     return found
 
 
+NO_STRUCTURE = StructureWeights(shared_edges=0.0, upper_inliers=0.0, contrast=0.0)
+
+
 def refined(bundle, cloud, *frames, prior=None, **weights):
-    support = SupportWeights(**weights) if weights else SupportWeights()
+    support = SupportWeights(**{"structure": NO_STRUCTURE, **weights}) if weights else SupportWeights()
     return refine(
         bundle, cloud, frames, prior, RefineSettings(starts=EVERY_VIEW, support=support, registration=BY_INLIERS)
     )
@@ -427,7 +431,9 @@ def test_the_best_supported_candidate_is_adjusted_and_its_covariance_is_that_of_
     assert noise == 2e-4
     assert model is OF_RAYS
     assert heading == heading_of_camera(found.best.T_map_camera)
-    np.testing.assert_array_equal(found.covariance, covariance_of(information, scatter, noise, heading, OF_RAYS))
+    of_rays = covariance_of(information, scatter, noise, heading, OF_RAYS)
+    np.testing.assert_array_equal(found.registration_covariance, of_rays)
+    np.testing.assert_array_equal(found.covariance, of_rays + map_covariance(*bundle.manifest.survey_std))
 
 
 def test_with_too_few_intersections_pose_and_covariance_are_those_of_the_points(

@@ -13,6 +13,7 @@ from service.scoring.measured import measure
 from service.scoring.photometry import BrightnessScorer, PhotometrySettings
 from service.scoring.prior import PriorScorer
 from service.scoring.scorer import Scorer, Scores
+from service.scoring.structure import StructureScorer, StructureWeights
 from service.scoring.support import LocalScoreWeights, PoseScorer, SupportWeights, scorers_of
 
 PRIOR = Prior(position_m=np.array([4.0, 0.0]), position_std_m=3.0, heading_rad=0.2)
@@ -49,11 +50,20 @@ def brightness(street_map, measured):
 
 
 @pytest.fixture
-def candidates_of(measured, brightness, poses):
+def structure(street_map, measured):
+    return StructureScorer(street_map, measured, StructureWeights())
+
+
+@pytest.fixture
+def scorer_of(measured, structure, brightness):
+    """Return the scorer of poses, for scorers and their weights."""
+    return lambda *scorers: PoseScorer(measured, scorers, structure, brightness, SupportWeights(), LocalScoreWeights())
+
+
+@pytest.fixture
+def candidates_of(scorer_of, poses):
     """Return the candidates of three poses, for scorers and their weights."""
-    return lambda *scorers: PoseScorer(measured, scorers, brightness, SupportWeights(), LocalScoreWeights()).candidates(
-        poses
-    )
+    return lambda *scorers: scorer_of(*scorers).candidates(poses)
 
 
 def test_a_new_scorer_needs_a_line_in_the_list_and_nothing_else(candidates_of, poses):
@@ -80,12 +90,41 @@ def test_the_prior_scores_the_position_and_heading_of_each_pose_however_it_leans
 
 @pytest.mark.parametrize(("prior", "names"), [(None, ()), (PRIOR, ("prior",))])
 def test_every_scorer_has_the_same_interface_and_a_name_of_its_own(
-    bundle_at, street_map, measured, brightness, prior, names
+    bundle_at, street_map, measured, structure, brightness, prior, names
 ):
     bundle = bundle_at([(0.0, 0.0, 1.8)], [0.0], [(1.0, 0.0)])
     weights = SupportWeights()
     listed = scorers_of(bundle, street_map, measured, prior, weights)
     assert tuple(scorer.name for scorer, _ in listed) == ("inliers", "similarity", "likelihood", *names)
     assert all(weight == getattr(weights, scorer.name) for scorer, weight in listed)
-    assert all(isinstance(scorer, Scorer) for scorer in (brightness, *(scorer for scorer, _ in listed)))
-    assert brightness.score(()).values.shape == (0,)
+    assert all(isinstance(scorer, Scorer) for scorer in (structure, brightness, *(scorer for scorer, _ in listed)))
+    for each in (structure, brightness):
+        assert each.score(()).values.shape == (0,)
+
+
+def test_only_candidates_near_the_best_get_a_structure_and_the_others_stay_behind(scorer_of, poses, monkeypatch):
+    """Supports of 13, 11 and 2 nats. The first two get 1 and 6 nats of structure, and the third the lower of these."""
+    asked = []
+
+    def structure(_, poses):
+        asked.extend(poses)
+        nats = np.array([1.0, 6.0])
+        return Scores(nats, {"shared_edges": nats / 10})
+
+    monkeypatch.setattr(StructureScorer, "score", structure)
+    scorer = scorer_of((InlierScorer(), 1.0))
+    first, second, third = (
+        replace(each, support=support)
+        for each, support in zip(scorer.candidates(poses), (13.0, 11.0, 2.0), strict=True)
+    )
+    found = scorer.with_details([first, second, third])
+    assert asked == [first.registered, second.registered]
+    assert [each.support for each in found] == [17.0, 14.0, 3.0]
+    assert [each.registered for each in found] == [second.registered, first.registered, third.registered]
+    assert found[0].scores == {**second.scores, "structure": 6.0, "shared_edges": 0.6}
+    assert "structure" not in found[2].scores
+
+
+def test_candidates_with_brightness_must_have_a_structure():
+    with pytest.raises(ValueError, match=r"brightness_gap: 9 must be at most structure_gap \(8\)"):
+        SupportWeights(brightness_gap=9.0)
