@@ -13,9 +13,9 @@ from service.registration.covariance import (
     OF_RAYS,
     covariance_of,
     disagreement,
-    map_covariance,
     rectification_covariance,
     score_outer_product,
+    survey_covariance,
 )
 from service.registration.local_search import LocalSearchSettings, search_locally
 from service.registration.points import FOCAL_BASELINE_PX_M, PointSettings
@@ -154,7 +154,7 @@ def refine(
     noise = float(np.median([frame.noise for frame in frames]))
     heading = heading_of_camera(candidates[0].T_map_camera)
     of_registration = covariance_of(best.information, scatter, noise, heading, model)
-    systematic = map_covariance(*bundle.manifest.survey_std)
+    systematic = survey_covariance(*bundle.manifest.survey_std)
     if reference.query.baseline_m is not None:
         systematic = systematic + rectification_covariance(reference.views.height_m, reference.query.baseline_m)
     candidates[0] = replace(candidates[0], covariance=of_registration + systematic)

@@ -72,31 +72,21 @@ OF_RAYS = CovarianceModel(
 
 #: Standard deviations of a survey's poses that the floors of the models above contain: position (m) and angle (degrees).
 FLOOR_SURVEY_M, FLOOR_SURVEY_DEG = 0.03, 0.05
-#: Standard deviations of the map itself: x, y, z (m), and its tilt (degrees). Surfels are means of points from several scans, and a LiDAR
-#: sees the ground at grazing angles. Calibration cities (decision 0160).
-MAP_M, MAP_TILT_DEG = (0.03, 0.03, 0.01), 0.1
-#: Distance (m) over which the position errors of a survey turn the map: two independent errors at its ends. The alignment of the survey
-#: makes neighbouring scans agree, so the errors that remain change slowly. The turn is at most ``MOST_TURN_DEG``, degrees (decision 0160).
-TURNED_OVER_M, MOST_TURN_DEG = 20.0, 0.5
 
 
-def map_covariance(position_std_m: float | None, angle_std_deg: float | None) -> Float64[NDArray[np.float64], "6 6"]:
-    """Return the covariance that the map's errors add to a pose: translation (m), then rotation (rad).
+def survey_covariance(position_std_m: float | None, angle_std_deg: float | None) -> Float64[NDArray[np.float64], "6 6"]:
+    """Return the covariance that the errors of the survey's poses add to a pose in the map: translation (m), then rotation (rad).
 
-    A query is registered to the scans around it, and their common error moves and turns its pose. The scans cannot show this error,
-    because they agree with each other. So the map states it. The floors of the models contain the position and angle errors of a usual
-    survey; of these, only the excess is added.
+    A query is registered to the scans around it, and their common error moves its pose. The scans cannot show this error, because they
+    agree with each other. So the map states it. The floors of the models contain a survey with usual errors. Only the excess is added.
 
     Args:
         position_std_m: standard deviation of the survey's positions per axis, metres; None counts as usual.
         angle_std_deg: standard deviation of the survey's angles, degrees; None counts as usual.
     """
-    position_m = FLOOR_SURVEY_M if position_std_m is None else position_std_m
-    position = max(position_m**2 - FLOOR_SURVEY_M**2, 0.0) + np.array(MAP_M) ** 2
+    position = max((position_std_m or 0.0) ** 2 - FLOOR_SURVEY_M**2, 0.0)
     angle = max((angle_std_deg or 0.0) ** 2 - FLOOR_SURVEY_DEG**2, 0.0) * np.deg2rad(1.0) ** 2
-    tilt = float(np.deg2rad(MAP_TILT_DEG))
-    turn = min(float(np.sqrt(2.0)) * position_m / TURNED_OVER_M, float(np.deg2rad(MOST_TURN_DEG)))
-    return np.diag([*position, angle + tilt**2, angle + tilt**2, angle + turn**2])
+    return np.diag([position] * 3 + [angle] * 3)
 
 
 #: Standard deviation of roll and pitch from the rectification of a stereo pair, degrees, at a height that equals the baseline. A right

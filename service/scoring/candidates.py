@@ -44,7 +44,7 @@ class Refined:
     Attributes:
         candidates: registered poses, the best supported first.
         covariance: of the best candidate: translation (m), then rotation (rad), in map axes, about the camera.
-        registration_covariance: the part of it without the errors of the map and of a stereo pair's rectification.
+        registration_covariance: the part of it without the errors of the survey and of a stereo pair's rectification.
         points: number of registered points, over all frames.
         disagreement: variance inflation at the best pose: how much the image patches disagree about it, relative to their noise.
         covariance_at: function that computes the covariance of a candidate without ray adjustment: of every one but the best.

@@ -7,7 +7,7 @@ from service.geometry.camera import PinholeCamera
 from service.geometry.rigid import R_BODY_OPTICAL, heading_of_camera, inverse, rotation_y, rotation_z, transform_from
 from service.localization import refine as refining
 from service.localization.refine import RefineSettings, refine, settings_for_rig
-from service.registration.covariance import OF_POINTS, OF_RAYS, covariance_of, map_covariance, score_outer_product
+from service.registration.covariance import OF_POINTS, OF_RAYS, covariance_of, score_outer_product
 from service.registration.local_search import LocalPose
 from service.registration.points import PointSettings, inverse_depth_noise
 from service.registration.rays import RaySettings, adjust
@@ -431,9 +431,7 @@ def test_the_best_supported_candidate_is_adjusted_and_its_covariance_is_that_of_
     assert noise == 2e-4
     assert model is OF_RAYS
     assert heading == heading_of_camera(found.best.T_map_camera)
-    of_rays = covariance_of(information, scatter, noise, heading, OF_RAYS)
-    np.testing.assert_array_equal(found.registration_covariance, of_rays)
-    np.testing.assert_array_equal(found.covariance, of_rays + map_covariance(*bundle.manifest.survey_std))
+    np.testing.assert_array_equal(found.covariance, covariance_of(information, scatter, noise, heading, OF_RAYS))
 
 
 def test_with_too_few_intersections_pose_and_covariance_are_those_of_the_points(

@@ -208,28 +208,17 @@ def test_in_a_corridor_the_position_along_it_is_the_least_known(scene_of, start_
     assert np.sqrt(variances[1]) < 0.05
 
 
-#: Position (m) and tilt (rad) of the map itself.
-MAP_ONLY = [0.03, 0.03, 0.01, np.deg2rad(0.1), np.deg2rad(0.1)]
+def test_a_survey_with_usual_errors_adds_nothing():
+    """The floors include this error. A map without a stated accuracy counts as usual."""
+    for usual in ((None, None), (0.03, 0.05), (0.0, 0.0)):
+        np.testing.assert_array_equal(covariance.survey_covariance(*usual), np.zeros((6, 6)))
 
 
-def test_a_survey_with_usual_errors_adds_only_the_maps_own():
-    """The floors include such a survey. A map without a stated accuracy counts as usual: 0.03 m turn 20 m by 0.03 sqrt(2) / 20."""
-    for usual, turn in (((None, None), 0.002121), ((0.03, 0.05), 0.002121), ((0.0, 0.0), 0.0)):
-        found = covariance.map_covariance(*usual)
-        np.testing.assert_allclose(np.sqrt(np.diag(found)), [*MAP_ONLY, turn], atol=1e-6)
-
-
-def test_a_poor_survey_adds_the_excess_of_its_variance_and_turns_the_map():
-    """0.05^2 - 0.03^2 = 0.04^2 m^2, and 0.13^2 - 0.05^2 = 0.12^2 square degrees. 0.05 m turn 20 m by 0.0035 rad."""
-    found = covariance.map_covariance(0.05, 0.13)
-    angle = np.deg2rad(0.12)
-    expected = np.sqrt([0.0025, 0.0025, 0.0017, *[angle**2 + np.deg2rad(0.1) ** 2] * 2, angle**2 + 2 * 0.0025**2])
-    np.testing.assert_allclose(np.sqrt(np.diag(found)), expected)
+def test_a_poor_survey_adds_the_excess_of_its_variance():
+    """0.05^2 - 0.03^2 = 0.04^2 m^2, and 0.13^2 - 0.05^2 = 0.12^2 square degrees."""
+    found = covariance.survey_covariance(0.05, 0.13)
+    np.testing.assert_allclose(np.sqrt(np.diag(found)), [0.04] * 3 + [np.deg2rad(0.12)] * 3)
     np.testing.assert_array_equal(found, np.diag(np.diag(found)))
-
-
-def test_a_survey_without_good_positions_turns_the_map_by_half_a_degree_at_most():
-    assert np.sqrt(covariance.map_covariance(5.0, None)[5, 5]) == pytest.approx(np.deg2rad(0.5))
 
 
 @pytest.mark.parametrize(
