@@ -69,11 +69,19 @@ def test_evidence_out_of_range_is_named_in_the_order_of_likelihood(calibration_o
     calibration = calibration_of()
     evidence = np.tile([each.mean for each in calibration.features], (5, 1))
     assert out_of_range(calibration, evidence) == []
-    for name in ("margin", "log_noise", "through"):
-        evidence[:, FEATURES.index(name)] += 5 * calibration.features[FEATURES.index(name)].std
+    for name, deviations in (("margin", -5), ("log_noise", 5), ("through", 5)):
+        evidence[:, FEATURES.index(name)] += deviations * calibration.features[FEATURES.index(name)].std
     told = out_of_range(calibration, evidence)
     assert [each.what.split(" (")[0] for each in told] == ["baseline", "traffic in the map", "calibration"]
     assert "log_noise +5.0" in told[0].what
+
+
+def test_evidence_better_than_the_calibration_data_is_no_reason(calibration_of):
+    calibration = calibration_of()
+    evidence = np.tile([each.mean for each in calibration.features], (5, 1))
+    for name, deviations in (("margin", 5), ("mapped_inliers", 5), ("contrast", 5), ("through", -5)):
+        evidence[:, FEATURES.index(name)] += deviations * calibration.features[FEATURES.index(name)].std
+    assert out_of_range(calibration, evidence) == []
 
 
 def test_answers_without_evidence_speak_of_depth(calibration_of):
