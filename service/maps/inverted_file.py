@@ -259,9 +259,9 @@ def recall_of(opened: Shortlister, numbers: Rows, asked: _Asked, tenth: NDArray[
 
     Args:
         opened: the index.
-        numbers: descriptors of all views.
-        asked: descriptors of the queries.
-        tenth: similarity of each query's tenth best view.
+        numbers: descriptors of all views (n, D).
+        asked: descriptors of the queries (q, D).
+        tenth: similarity of each query's tenth best view (q,).
     """
     best, listed = min(_BEST, len(numbers)), min(_LISTED, len(numbers))
     found = 0
