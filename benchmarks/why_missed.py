@@ -64,10 +64,11 @@ _BORDERS = (
     "of the vote gained half a point in four other cities, and nothing here"
 )
 _HEIGHTS = (
-    "Confidence causes most losses: forced answers within 1 m are 0.93, 0.945, 0.955, 0.975, 0.97 and 0.975 from 0.2 to 3.5 m, and at "
-    "most 0.005 are accepted and wrong. The default needs a confidence of 0.9 since decision 0149. The rows before accepted more, and more "
-    "wrong ones. Training on cameras of 0.3 to 3.2 m (decision 0154) raised the forced share at 0.2 m from 0.815 to 0.93. The height "
-    "estimate has an error of 0.02 to 0.04 m, and a given height gains nothing. Next: low and high cameras in the calibration"
+    "Confidence causes most losses: forced answers within 1 m are 0.93, 0.945, 0.955, 0.975, 0.985 and 0.985 from 0.2 to 3.5 m, and at "
+    "most 0.01 are accepted and wrong. The default needs a confidence of 0.9 since decision 0149. Tried: training on cameras of 0.3 to "
+    "3.2 m (decision 0154; forced at 0.2 m 0.815 -> 0.93), depth structure (decision 0159; accepted at 0.2 m 0.775 -> 0.84, at 3.5 m "
+    "0.885 -> 0.93). A given height gains nothing, because the estimate errs by 0.02 to 0.04 m. Next: low and high cameras in the "
+    "calibration"
 )
 _OVER_BARE = (
     "Medians of runs differ by up to 10 %: full REST 0.97 to 1.13, retrieval REST 1.14 to 1.27, gRPC 1.15 to 1.29. A full "
@@ -163,18 +164,17 @@ WHY_MISSED: dict[str, Reason] = {
         "precise camera, heights cause it. The height error of a map differs between cities (0.015 to 0.022 m in calibration), "
         "but all maps share one floor. Next step: let the map build estimate the errors of the map",
     ),
-    "height.0.2.within_1_m": Reason(0.775, _HEIGHTS),
-    "height.0.2.given.within_1_m": Reason(0.78, _HEIGHTS),
-    "height.0.4.within_1_m": Reason(0.855, _HEIGHTS),
-    "height.0.4.given.within_1_m": Reason(0.855, _HEIGHTS),
-    "height.0.8.within_1_m": Reason(0.85, _HEIGHTS),
-    "height.0.8.given.within_1_m": Reason(0.85, _HEIGHTS),
-    "height.1.5.within_1_m": Reason(0.92, _HEIGHTS),
-    "height.1.5.given.within_1_m": Reason(0.925, _HEIGHTS),
-    "height.2.5.within_1_m": Reason(0.9, _HEIGHTS),
-    "height.2.5.given.within_1_m": Reason(0.905, _HEIGHTS),
-    "height.3.5.within_1_m": Reason(0.885, _HEIGHTS),
-    "height.3.5.given.within_1_m": Reason(0.895, _HEIGHTS),
+    "height.0.2.within_1_m": Reason(0.84, _HEIGHTS),
+    "height.0.2.given.within_1_m": Reason(0.84, _HEIGHTS),
+    "height.0.4.within_1_m": Reason(0.885, _HEIGHTS),
+    "height.0.4.given.within_1_m": Reason(0.89, _HEIGHTS),
+    "height.0.8.within_1_m": Reason(0.91, _HEIGHTS),
+    "height.0.8.given.within_1_m": Reason(0.89, _HEIGHTS),
+    "height.1.5.within_1_m": Reason(0.93, _HEIGHTS),
+    "height.1.5.given.within_1_m": Reason(0.935, _HEIGHTS),
+    "height.2.5.given.within_1_m": Reason(0.95, _HEIGHTS),
+    "height.3.5.within_1_m": Reason(0.93, _HEIGHTS),
+    "height.3.5.given.within_1_m": Reason(0.93, _HEIGHTS),
     "real.kitti_0013.recall_at_1_10m": Reason(
         0.9583333,
         "One of 24 queries misses. With 24 queries the bar allows no miss. Retrieval alone finds 17 within 5 m, and "
@@ -260,10 +260,11 @@ WHY_MISSED["docs.code_blocks_run"] = Reason(
     "Two commands of docs/robot.md named no service, so the run started none for them. They name it since this run",
 )
 WHY_MISSED["sequence.landmark.within_1_m"] = Reason(
-    0.3055555555555556,
-    "All 72 answers are within 1 m when forced, but 50 are AMBIGUOUS: their median confidence is 0.81, and the default needs 0.9 since "
-    "decision 0149. The row before (1.0) had the older default. The repeating street is one of 20 families of the calibration, and half "
-    "of its answers are wrong, so equal blocks lower the confidence. Next: a feature that tells a landmark from a repeated block",
+    0.3333333333333333,
+    "All 72 answers are within 1 m when forced, but 48 are AMBIGUOUS: their median confidence is 0.80, and the default needs 0.9 since "
+    "decision 0149. The repeating street is one of the families of the calibration, and half of its answers are wrong, so equal blocks "
+    "lower the confidence. Tried: a better encoder (decision 0154), depth structure (decision 0159; 50 -> 48). Next: a feature that tells a "
+    "landmark from a repeated block",
 )
 WHY_MISSED["train.two_process_loss_gap"] = Reason(
     0.05326234099074938,
