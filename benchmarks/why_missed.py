@@ -263,8 +263,8 @@ WHY_MISSED["sequence.landmark.within_1_m"] = Reason(
     0.3333333333333333,
     "All 72 answers are within 1 m when forced, but 48 are AMBIGUOUS: their median confidence is 0.80, and the default needs 0.9 since "
     "decision 0149. The repeating street is one of the families of the calibration, and half of its answers are wrong, so equal blocks "
-    "lower the confidence. Tried: a better encoder (decision 0154), depth structure (decision 0159; 50 -> 48). Next: a feature that tells a "
-    "landmark from a repeated block",
+    "lower the confidence. Tried: a better encoder (decision 0154), depth structure (decision 0159; 50 -> 48). Next: a feature that "
+    "tells a landmark from a repeated block",
 )
 WHY_MISSED["train.two_process_loss_gap"] = Reason(
     0.05326234099074938,
