@@ -20,7 +20,13 @@ DATASET_FILE = "dataset.json"
 #: Fields that describe when and with which tools the bundle was built. They do not affect the version.
 _CIRCUMSTANCES = {"version", "made_at", "tool_versions"}
 
+#: Folder of the tiles of a tiled map.
+TILES_FOLDER = "tiles"
+#: Limits of the edge of a tile, m, and of the number of a column or row: a map reaches around the Earth.
+SMALLEST_TILE_M, LARGEST_TILE_M, MOST_TILES = 50.0, 10_000.0, 1_000_000
+
 Sha256 = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
+Version = Annotated[str, Field(pattern=r"^[0-9a-f]{16}$")]
 #: Pattern of a map's name.
 NAME = r"^[A-Za-z0-9][A-Za-z0-9._-]{0,63}$"
 Name = Annotated[str, Field(pattern=NAME)]
@@ -82,6 +88,31 @@ class FileEntry(_Frozen):
     size: int = Field(ge=0)
 
 
+class Tile(_Frozen):
+    """One tile of a tiled map: a map bundle in the folder ``tiles/VERSION`` of the map.
+
+    Attributes:
+        column: the tile has the places with ``column * tile_m <= x < (column + 1) * tile_m``, map frame, metres.
+        row: the same for y.
+        version: version of the bundle.
+        manifest_sha256: SHA-256 of its ``manifest.json``, which has the hashes of its other files.
+        size: size of all its files, bytes.
+        counts: sizes of its parts.
+    """
+
+    column: int = Field(ge=-MOST_TILES, le=MOST_TILES)
+    row: int = Field(ge=-MOST_TILES, le=MOST_TILES)
+    version: Version
+    manifest_sha256: Sha256
+    size: int = Field(ge=0)
+    counts: Counts
+
+    @property
+    def folder(self) -> str:
+        """Folder of the bundle, relative to the folder of the map."""
+        return f"{TILES_FOLDER}/{self.version}"
+
+
 class Manifest(_Frozen):
     """Content of ``manifest.json``. The writer writes this file last and the reader reads it first.
 
@@ -101,11 +132,13 @@ class Manifest(_Frozen):
         licence: text of the licence. May be empty.
         files: every other file of the bundle, by its path relative to the bundle's folder.
         tool_versions: version of each tool that built the map, by name.
+        tile_m: edge of the tiles of a tiled map, metres; None for a map of one bundle.
+        tiles: tiles of a tiled map, by column and row. ``counts`` has their sums, and ``files`` what they share.
     """
 
     format: Literal[4]
     name: Name
-    version: Annotated[str, Field(pattern=r"^[0-9a-f]{16}$")]
+    version: Version
     made_at: AwareDatetime
     grid: GridParameters
     headings: int = Field(ge=1)
@@ -118,6 +151,8 @@ class Manifest(_Frozen):
     licence: str
     files: dict[str, FileEntry]
     tool_versions: dict[str, str]
+    tile_m: float | None = Field(default=None, ge=SMALLEST_TILE_M, le=LARGEST_TILE_M)
+    tiles: tuple[Tile, ...] = ()
 
     @property
     def view_grid(self) -> ViewGrid:
@@ -139,7 +174,7 @@ class Manifest(_Frozen):
 
         The build time and the tool versions do not count. So the same content gives the same version.
         """
-        content = self.model_dump(mode="json", exclude=_CIRCUMSTANCES)
+        content = {name: value for name, value in self._document().items() if name not in _CIRCUMSTANCES}
         return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:16]
 
     def stamped(self) -> "Manifest":
@@ -148,7 +183,11 @@ class Manifest(_Frozen):
 
     def to_bytes(self) -> bytes:
         """Return the content of ``manifest.json``."""
-        return (json.dumps(self.model_dump(mode="json"), indent=1, sort_keys=True) + "\n").encode()
+        return (json.dumps(self._document(), indent=1, sort_keys=True) + "\n").encode()
+
+    def _document(self) -> dict[str, Any]:
+        """Return the content for JSON. A map of one bundle has no fields of tiles."""
+        return self.model_dump(mode="json", exclude=set() if self.tiles else {"tile_m", "tiles"})
 
 
 def read_manifest(directory: Path) -> Manifest:
@@ -225,9 +264,25 @@ def _require_consistent(path: Path, manifest: Manifest) -> None:
         what = f"georeference: {wrong}"
     elif bad := [name for name in manifest.files if not is_confined(name)]:
         what = f"the file {bad[0]!r} is outside the bundle"
+    elif wrong := _wrong_tiles(manifest):
+        what = f"tiles: {wrong}"
     else:
         return
     raise BundleError(f"{path}: {what}; copy or build the bundle again", field=FILE)
+
+
+def _wrong_tiles(manifest: Manifest) -> str | None:
+    """Return what is wrong with the tiles, or None if they are valid or the map has none."""
+    tiles, counts = manifest.tiles, manifest.counts
+    if (manifest.tile_m is None) != (not tiles):
+        return "tile_m and tiles must both be there, or both be missing"
+    order = [(tile.column, tile.row) for tile in tiles]
+    if order != sorted(set(order)):
+        return "a column and row occurs twice, or the order is wrong"
+    for part in ("places", "views", "cloud_points") if tiles else ():
+        if (total := sum(getattr(tile.counts, part) for tile in tiles)) != getattr(counts, part):
+            return f"the counts give {getattr(counts, part)} {part}, but the tiles have {total}"
+    return None
 
 
 def not_on_earth(georeference: Mapping[str, Any] | None) -> str | None:
