@@ -21,8 +21,8 @@ from service.registration.local_search import LocalSearchSettings, search_locall
 from service.registration.points import FOCAL_BASELINE_PX_M, PointSettings
 from service.registration.rays import RaySettings, adjust
 from service.registration.register import RegistrationSettings, Start, register
-from service.registration.surfel_map import SurfelMap
-from service.registration.visibility import SurfelRaycaster
+from service.registration.surfel_tiles import Cloud
+from service.registration.visibility import Raycasters
 from service.retrieval.prior import Prior
 from service.retrieval.retrieve import Frame
 from service.retrieval.starts import StartSettings, starts_from
@@ -88,7 +88,7 @@ OFFSET_PX = 0.6
 
 def refine(
     bundle: MapBundle,
-    cloud: SurfelMap,
+    cloud: Cloud,
     frames: tuple[Frame, ...],
     prior: Prior | None,
     settings: RefineSettings,
@@ -98,7 +98,7 @@ def refine(
 
     Args:
         bundle: the map.
-        cloud: surfels of the map.
+        cloud: cloud of the map.
         frames: image pairs, the reference first.
         prior: prior of the reference pose; None if nothing is known.
         settings: settings of registration and scoring.
@@ -126,12 +126,12 @@ def refine(
     starts += _starts_at(bundle, measured, reference, predicted, first=len(starts))
     found = register(cloud, points, starts, reference.views.height_m, settings.registration)
     # 3. Scores, and other local minima around the best pose.
-    raycaster = SurfelRaycaster(cloud, settings.rays)
+    raycasters = Raycasters(cloud, settings.rays)
     scorer = PoseScorer(
         measured,
         scorers_of(bundle, cloud, measured, prior, settings.support),
         StructureScorer(cloud, measured, settings.support.structure),
-        BrightnessScorer(raycaster, measured, settings.photometry),
+        BrightnessScorer(raycasters, measured, settings.photometry),
         settings.support,
         settings.near,
     )
@@ -144,9 +144,9 @@ def refine(
         candidates[0] = scorer.select_local_optimum(candidates[0], near)
     # 4. Adjustment of the best pose along the rays, and its covariance.
     best = candidates[0].registered
-    adjusted = adjust(raycaster, [each.picture for each in measured], best, settings.rays)
+    adjusted = adjust(raycasters.at(best.camera_m), [each.picture for each in measured], best, settings.rays)
     if adjusted is None:
-        scatter, model = score_outer_product(cloud, points, best, settings.registration), OF_POINTS
+        scatter, model = score_outer_product(cloud.at(best.camera_m), points, best, settings.registration), OF_POINTS
     else:
         (best, scatter), model = adjusted, OF_RAYS
         T_map_camera = transform_from(best.R_map_level @ reference.R_level_camera, best.camera_m)
@@ -161,7 +161,7 @@ def refine(
 
     def covariance_at(candidate: Candidate) -> Float64[NDArray[np.float64], "6 6"]:
         pose = candidate.registered
-        scatter_at = score_outer_product(cloud, points, pose, settings.registration)
+        scatter_at = score_outer_product(cloud.at(pose.camera_m), points, pose, settings.registration)
         heading_at = heading_of_camera(candidate.T_map_camera)
         return covariance_of(pose.information, scatter_at, noise, heading_at, OF_POINTS) + systematic
 

@@ -12,9 +12,9 @@ from jaxtyping import Float64
 from numpy.typing import NDArray
 
 from service.geometry.rigid import rotation_z
-from service.registration.kernel import STATE, QueryPoints, align
+from service.registration.kernel import STATE, QueryPoints
 from service.registration.register import Registered, RegistrationSettings, registered_of, score
-from service.registration.surfel_map import SurfelMap
+from service.registration.surfel_tiles import Cloud
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -64,7 +64,7 @@ class LocalPose:
 
 
 def search_locally(
-    cloud: SurfelMap,
+    cloud: Cloud,
     points: QueryPoints,
     found: Registered,
     height_m: float,
@@ -74,7 +74,7 @@ def search_locally(
     """Return the given pose and the best other poses around it.
 
     Args:
-        cloud: surfel map.
+        cloud: cloud of the map.
         points: of the query, in its level frame. Static points have the largest weight.
         found: the registered pose to search around, map frame.
         height_m: height of the camera above the ground, m.
@@ -91,7 +91,7 @@ def search_locally(
         state["R"] = found.R_map_level @ rotation_z(turn)
         state["t"] += found.R_map_level @ [along, across, 0.0]
     states["anchor"], states["up"] = states["t"], found.R_map_level[:, 2]
-    align(cloud.grid, cloud.surfels, points.thinned(around.points), states[1:], settings.fine)
+    cloud.align(points.thinned(around.points), states[1:], settings.fine)
     score(cloud, points, states, height_m, settings)
     static_states = states.copy()
     score(cloud, points.subset(np.flatnonzero(points.weight == points.weight.max())), static_states, height_m, settings)

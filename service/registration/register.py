@@ -11,8 +11,8 @@ from jaxtyping import Float64
 from numpy.typing import NDArray
 
 from service.geometry.rigid import Rotation, Transform, rotation_z, transform_from
-from service.registration.kernel import STATE, QueryPoints, SolverOptions, align
-from service.registration.surfel_map import SurfelMap
+from service.registration.kernel import STATE, QueryPoints, SolverOptions
+from service.registration.surfel_tiles import Cloud
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -133,12 +133,12 @@ class Registered:
 
 
 def register(
-    cloud: SurfelMap, points: QueryPoints, starts: list[Start], height_m: float, settings: RegistrationSettings
+    cloud: Cloud, points: QueryPoints, starts: list[Start], height_m: float, settings: RegistrationSettings
 ) -> tuple[Registered, ...]:
     """Register a query from every start and return the refined poses, the largest share of inliers first.
 
     Args:
-        cloud: surfel map.
+        cloud: cloud of the map.
         points: of the query, in its level frame.
         starts: at least one. If a hypothesis has several, the similarity of its last one counts.
         height_m: height of the camera above the ground, m.
@@ -146,9 +146,7 @@ def register(
     """
     states, owner = _states(cloud, starts, settings)
     ground = settings.ground_m - height_m
-    align(
-        cloud.grid,
-        cloud.surfels,
+    cloud.align(
         points.thinned(settings.coarse_points),
         states,
         settings.coarse,
@@ -157,9 +155,7 @@ def register(
     )
     kept = _best_of_each(states, owner, settings)
     best, owner = states[kept].copy(), owner[kept]
-    align(
-        cloud.grid,
-        cloud.surfels,
+    cloud.align(
         points.thinned(settings.middle_points),
         best,
         settings.middle,
@@ -171,28 +167,26 @@ def register(
     promise = best["inliers"] + settings.similarity_weight * similarity
     kept = _distinct(best, promise, settings.refined, settings.apart_m)
     best, owner = best[kept].copy(), owner[kept]
-    align(cloud.grid, cloud.surfels, points.with_least_weight(settings.fine_weight), best, settings.fine)
+    cloud.align(points.with_least_weight(settings.fine_weight), best, settings.fine)
     score(cloud, points, best, height_m, settings)
     order = np.argsort(-best["inliers"], kind="stable")
     return tuple(registered_of(best[k], int(owner[k]), cloud.origin_m) for k in order)
 
 
 def score(
-    cloud: SurfelMap, points: QueryPoints, states: NDArray[Any], height_m: float, settings: RegistrationSettings
+    cloud: Cloud, points: QueryPoints, states: NDArray[Any], height_m: float, settings: RegistrationSettings
 ) -> None:
     """Compute the share of inliers of every state at its present pose, in place.
 
     Args:
-        cloud: surfel map.
+        cloud: cloud of the map.
         points: of the query, in its level frame.
         states: poses in the surfels' frame, (n,) of ``STATE``. Their field ``inliers`` is overwritten.
         height_m: height of the camera above the ground, m.
         settings: of registration.
     """
     score_only = replace(settings.fine, iterations=0)
-    align(
-        cloud.grid,
-        cloud.surfels,
+    cloud.align(
         points,
         states,
         score_only,
@@ -223,9 +217,7 @@ def registered_of(state: Any, hypothesis: int, origin_m: Float64[NDArray[np.floa
     )
 
 
-def _states(
-    cloud: SurfelMap, starts: list[Start], settings: RegistrationSettings
-) -> tuple[NDArray[Any], NDArray[np.intp]]:
+def _states(cloud: Cloud, starts: list[Start], settings: RegistrationSettings) -> tuple[NDArray[Any], NDArray[np.intp]]:
     offsets = np.array([(along, across, 0.0) for along, across in settings.offsets_m])
     turned = len(starts) * len(offsets) * (1 + len(settings.turns_rad)) <= settings.most_starts
     turns = (0.0, *settings.turns_rad) if turned else (0.0,)

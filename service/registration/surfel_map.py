@@ -12,7 +12,16 @@ from jaxtyping import Float32, Float64
 from numpy.typing import NDArray
 
 from service.errors import BundleError
-from service.registration.kernel import GRID_BLOCK, GRID_REGION, SURFEL, NearestGrid, nearest_grid
+from service.registration.kernel import (
+    GRID_BLOCK,
+    GRID_REGION,
+    SURFEL,
+    NearestGrid,
+    QueryPoints,
+    SolverOptions,
+    align,
+    nearest_grid,
+)
 
 #: Edge of a cell of the lookup grid, and largest distance from a surfel to a cell that refers to it, m.
 CELL_M, REACH_M = 0.4, 1.2
@@ -76,6 +85,39 @@ class SurfelMap:
         if brightness is not None and not (brightness > 0).any():
             brightness = None
         return cls(origin_m, surfels, tiles, nearest_grid(surfels, cell_m=CELL_M, reach_m=REACH_M), brightness)
+
+    @property
+    def has_brightness(self) -> bool:
+        """Whether the map has intensities."""
+        return self.brightness is not None
+
+    def at(self, position_m: Float64[NDArray[np.float64], "3"]) -> "SurfelMap":  # noqa: ARG002 - as of SurfelTiles
+        """Return the surfel map at a position: this one. A tiled map has several (``SurfelTiles.at``).
+
+        Args:
+            position_m: position, map frame, m.
+        """
+        return self
+
+    def align(
+        self,
+        points: QueryPoints,
+        states: NDArray[Any],
+        options: SolverOptions,
+        *,
+        tolerance_m: float = 0.1,
+        height_min_m: float = -1e9,
+    ) -> None:
+        """Register every start on this cloud, in place, then score it (``kernel.align``).
+
+        Args:
+            points: of the query.
+            states: starts, (n,) of ``STATE``, relative to ``origin_m``; overwritten with the results.
+            options: of the solver.
+            tolerance_m: standard deviation of a point's distance to its surface in the score, m, apart from its noise.
+            height_min_m: points lower than this do not count in the score, m.
+        """
+        align(self.grid, self.surfels, points, states, options, tolerance_m=tolerance_m, height_min_m=height_min_m)
 
     def arrays(self) -> dict[str, NDArray[Any]]:
         """Return the arrays to write, by name; ``from_arrays`` reads them again.

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Int32
+from jaxtyping import Float64, Int32
 from numpy.typing import NDArray
 
 from service.compiled import load
@@ -21,6 +21,7 @@ from service.geometry.camera import PinholeCamera
 from service.geometry.rigid import Transform
 from service.registration.kernel import SURFEL
 from service.registration.surfel_map import TILE_M, SurfelMap
+from service.registration.surfel_tiles import Cloud
 
 LIBRARY = Path(__file__).with_name("_rays.so")
 #: Largest distance (m) and rotation (rad) of a pose from the one whose collected surfels it reuses.
@@ -242,3 +243,34 @@ class SurfelRaycaster:
                 if (sign * sides <= 1e-6).all():  # an edge of the hull: all points lie on its inner side
                     visible &= sign * ((centres - hull[one]) @ outward) <= half
         return np.ascontiguousarray(self.cloud.tiles[visible, 2:4].astype(np.int64))
+
+
+class Raycasters:
+    """Ray casting for one request on the cloud of a map: one ``SurfelRaycaster`` for each surfel map of it.
+
+    Args:
+        cloud: cloud of the map.
+        settings: of the discs.
+    """
+
+    def __init__(self, cloud: Cloud, settings: DiscSettings) -> None:
+        self._cloud, self._settings = cloud, settings
+        self._opened: list[SurfelRaycaster] = []
+
+    @property
+    def have_brightness(self) -> bool:
+        """Whether all surfels of the map may have a brightness."""
+        return self._cloud.has_brightness
+
+    def at(self, position_m: Float64[NDArray[np.float64], "3"]) -> SurfelRaycaster:
+        """Return the ray casting on the surfel map at a position.
+
+        Args:
+            position_m: position, map frame, m.
+        """
+        cloud = self._cloud.at(position_m)
+        for opened in self._opened:
+            if opened.cloud is cloud:
+                return opened
+        self._opened.append(SurfelRaycaster(cloud, self._settings))
+        return self._opened[-1]

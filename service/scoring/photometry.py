@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from service.geometry.camera import PinholeCamera
 from service.registration.rays import cast_rays
 from service.registration.register import Registered
-from service.registration.visibility import SurfelRaycaster
+from service.registration.visibility import Raycasters
 from service.scoring.measured import MeasuredFrame
 from service.scoring.scorer import Scores
 
@@ -152,7 +152,7 @@ class BrightnessScorer:
     """Scorer by the agreement of a query's images with the brightness of the map.
 
     Args:
-        raycaster: ray casting into the map cloud.
+        raycasters: ray casting into the cloud of the map.
         measured: frames of the query, the reference first.
         settings: of the score.
     """
@@ -160,16 +160,16 @@ class BrightnessScorer:
     name = "brightness"
 
     def __init__(
-        self, raycaster: SurfelRaycaster, measured: tuple[MeasuredFrame, ...], settings: PhotometrySettings
+        self, raycasters: Raycasters, measured: tuple[MeasuredFrame, ...], settings: PhotometrySettings
     ) -> None:
-        self._raycaster, self._measured, self._settings = raycaster, measured, settings
+        self._raycasters, self._measured, self._settings = raycasters, measured, settings
         self._greys: list[Float32[NDArray[np.float32], "H W"]] | None = None
         self._seen: list[Bool[NDArray[np.bool_], "H W"] | None] = []
 
     @property
     def is_known(self) -> bool:
         """Whether the map has brightness."""
-        return self._raycaster.cloud.brightness is not None
+        return self._raycasters.have_brightness
 
     def score(self, poses: tuple[Registered, ...]) -> Scores:
         """Return the mean squared correlation over all frames, 0 to 1; 0 if the map has no brightness.
@@ -177,8 +177,7 @@ class BrightnessScorer:
         Args:
             poses: registered poses of the reference's level frame.
         """
-        brightness = self._raycaster.cloud.brightness
-        if brightness is None:
+        if not self.is_known:
             return Scores(np.zeros(len(poses)))
         if self._greys is None:  # many queries need no brightness, so the images are reduced at the first score
             self._greys = [
@@ -191,18 +190,21 @@ class BrightnessScorer:
                 else seen_by_lens(each.frame.query.observed, each.blocks.camera, each.blocks.covered)
                 for each in self._measured
             ]
-        return Scores(np.array([self._mean(brightness, self._greys, pose) for pose in poses]))
+        return Scores(np.array([self._mean(self._greys, pose) for pose in poses]))
 
     def _mean(
         self,
-        brightness: Float32[NDArray[np.float32], " n"],
         greys: list[Float32[NDArray[np.float32], "H W"]],
         pose: Registered,
     ) -> float:
+        raycaster = self._raycasters.at(pose.camera_m)
+        brightness = raycaster.cloud.brightness
+        if brightness is None:
+            return 0.0
         surfel_of = [
             own if seen is None else np.where(seen, own, np.int32(-1))
             for own, seen in zip(
-                cast_rays(self._raycaster, [each.picture for each in self._measured], pose), self._seen, strict=True
+                cast_rays(raycaster, [each.picture for each in self._measured], pose), self._seen, strict=True
             )
         ]
         pairs = zip(surfel_of, greys, strict=True)

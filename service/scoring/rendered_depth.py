@@ -15,6 +15,7 @@ from service.geometry.rigid import Rotation, transform_from
 from service.registration.kernel import BeamModel, QueryPoints, consistency, render
 from service.registration.register import Registered
 from service.registration.surfel_map import TILE_M, SurfelMap
+from service.registration.surfel_tiles import Cloud
 from service.scoring.measured import MeasuredFrame
 from service.scoring.scorer import Scores
 
@@ -141,13 +142,13 @@ class RenderedDepthScorer:
     """Scorer by the mean log likelihood of a query's depth, given the rendered map.
 
     Args:
-        cloud: surfel map.
+        cloud: cloud of the map.
         measured: frames of the query, the reference first.
     """
 
     name = "likelihood"
 
-    def __init__(self, cloud: SurfelMap, measured: tuple[MeasuredFrame, ...]) -> None:
+    def __init__(self, cloud: Cloud, measured: tuple[MeasuredFrame, ...]) -> None:
         self._cloud, self._measured = cloud, [each for each in measured if len(each.points)]
         self._projected = [
             project_points(each.points, each.frame.query.camera, each.frame.R_level_camera) for each in self._measured
@@ -165,5 +166,5 @@ class RenderedDepthScorer:
 
     def _agreement(self, pose: Registered) -> Agreement:
         """Mean over all frames that have points."""
-        pairs = zip(self._measured, self._projected, strict=True)
-        return Agreement.mean([agreement(self._cloud, projected, each.pose(pose)) for each, projected in pairs])
+        pairs, cloud = zip(self._measured, self._projected, strict=True), self._cloud.at(pose.camera_m)
+        return Agreement.mean([agreement(cloud, projected, each.pose(pose)) for each, projected in pairs])

@@ -17,7 +17,8 @@ from service.geometry.rigid import Rotation, transform_from
 from service.registration.kernel import render
 from service.registration.points import DepthBlocks
 from service.registration.register import Registered
-from service.registration.surfel_map import TILE_M, SurfelMap
+from service.registration.surfel_map import TILE_M
+from service.registration.surfel_tiles import Cloud
 from service.scoring.measured import MeasuredFrame
 from service.scoring.rendered_depth import REACH_M, SURFEL_M
 from service.scoring.scorer import Scores
@@ -227,14 +228,14 @@ class StructureScorer:
     """Scorer by depth structure. Its score is in nats: the sum of the three numbers of ``Structure`` with their weights.
 
     Args:
-        cloud: surfel map.
+        cloud: cloud of the map.
         measured: frames of the query, the reference first.
         weights: weights of the numbers.
     """
 
     name = "structure"
 
-    def __init__(self, cloud: SurfelMap, measured: tuple[MeasuredFrame, ...], weights: StructureWeights) -> None:
+    def __init__(self, cloud: Cloud, measured: tuple[MeasuredFrame, ...], weights: StructureWeights) -> None:
         self._cloud, self._weights = cloud, weights
         self._measured = [each for each in measured if len(each.points)]
         self._images = [
@@ -258,13 +259,13 @@ class StructureScorer:
         return Scores(found @ np.array(astuple(self._weights)), dict(zip(Structure.__slots__, found.T, strict=True)))
 
     def _structure(self, pose: Registered) -> NDArray[np.float64]:
-        found = []
+        found, cloud = [], self._cloud.at(pose.camera_m)
         for image, each in zip(self._images, self._measured, strict=True):
             own = each.pose(pose)
-            T = transform_from(own.R_map_level @ each.frame.R_level_camera, own.camera_m - self._cloud.origin_m)
+            T = transform_from(own.R_map_level @ each.frame.R_level_camera, own.camera_m - cloud.origin_m)
             rendered_m = render(
-                self._cloud.surfels,
-                self._cloud.tiles,
+                cloud.surfels,
+                cloud.tiles,
                 tile_m=TILE_M,
                 T_map_camera=T,
                 camera=CAMERA,

@@ -9,7 +9,7 @@ from service.geometry.rigid import transform_from
 from service.maps.reader import MapBundle
 from service.registration.local_search import LocalPose
 from service.registration.register import Registered
-from service.registration.surfel_map import SurfelMap
+from service.registration.surfel_tiles import Cloud
 from service.retrieval.prior import Prior
 from service.scoring.candidates import Candidate
 from service.scoring.inliers import InlierScorer
@@ -85,7 +85,7 @@ Weighted = tuple[Scorer, float]
 
 def scorers_of(
     bundle: MapBundle,
-    cloud: SurfelMap,
+    cloud: Cloud,
     measured: tuple[MeasuredFrame, ...],
     prior: Prior | None,
     weights: SupportWeights,
@@ -96,7 +96,7 @@ def scorers_of(
 
     Args:
         bundle: the map.
-        cloud: surfels of the map.
+        cloud: cloud of the map.
         measured: frames of the query, the reference first.
         prior: prior of the reference pose; None if nothing is known.
         weights: weights of the support.

@@ -6,7 +6,7 @@ import pytest
 from service.geometry.rigid import rotation_y, rotation_z
 from service.registration.points import PointSettings
 from service.registration.rays import RaySettings
-from service.registration.visibility import SurfelRaycaster
+from service.registration.visibility import Raycasters
 from service.retrieval.prior import Prior
 from service.scoring.inliers import InlierScorer
 from service.scoring.measured import measure
@@ -46,7 +46,7 @@ def measured(frame_with, matches_at):
 
 @pytest.fixture
 def brightness(street_map, measured):
-    return BrightnessScorer(SurfelRaycaster(street_map, RaySettings()), measured, PhotometrySettings())
+    return BrightnessScorer(Raycasters(street_map, RaySettings()), measured, PhotometrySettings())
 
 
 @pytest.fixture
