@@ -71,7 +71,7 @@ def times_of(localizer: Localizer, frame: QueryFrame) -> dict[str, Pair]:
         raise ValueError(f"{localizer.bundle.path} has no cloud; build the map with one")
     query = frame.query(localizer.bundle.grid)
     return _of_imaging(query, localizer.bundle.grid, frame.depth_path.read_bytes()) | _of_registration(
-        localizer, localizer.bundle.cloud, query
+        localizer, localizer.bundle.cloud.at(localizer.bundle.T_map_place[0, :3, 3]), query
     )
 
 

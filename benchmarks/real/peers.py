@@ -76,6 +76,7 @@ def peer_rows(
     cloud = localizer.bundle.cloud
     if cloud is None:
         raise ValueError(f"the map of {name} has no cloud")
+    cloud = cloud.at(localizer.bundle.T_map_place[0, :3, 3])
     points = cloud.origin_m + cloud.surfels["xyz"].astype(np.float64)
     map_points = thinned_to_voxels(points, 0.25)
 

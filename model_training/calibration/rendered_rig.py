@@ -203,11 +203,11 @@ def frames_of_rig(
         BundleError: the map has no cloud.
     """
     bundle = localizer.bundle
-    cloud = bundle.cloud
-    if cloud is None:
+    if bundle.cloud is None:
         raise BundleError(
             f"{bundle.path}: the map has no cloud to render images from; build the map again", field="cloud"
         )
+    cloud = bundle.cloud.at(bundle.T_map_place[0, :3, 3])
     dark = Localizer(replace(bundle, cloud=replace(cloud, brightness=None)), localizer.encoder)
     count = min(IMAGES, len(bundle.T_map_place))
     places = np.linspace(0, len(bundle.T_map_place) - 1, count).astype(int)

@@ -18,7 +18,7 @@ from model_training.mapping.survey import view_ranges
 from service.errors import NoDepthError
 from service.imaging.query_view import query_views
 from service.imaging.view_grid import ViewGrid
-from service.maps.reader import MapBundle
+from service.maps.map import Map
 from service.retrieval.retrieve import turns_on
 
 Ranges = NDArray[np.float32]
@@ -69,7 +69,7 @@ def similarities(queries: Ranges, views: Ranges) -> dict[str, Ranges]:
 
 
 def raw_best_views(
-    bundle: MapBundle,
+    bundle: Map,
     dataset: Dataset,
     names: list[str],
     *,
@@ -120,9 +120,7 @@ def raw_best_views(
     return best
 
 
-def _query_ranges(
-    bundle: MapBundle, dataset: Dataset, names: list[str], every: int
-) -> tuple[Ranges, NDArray[np.bool_]]:
+def _query_ranges(bundle: Map, dataset: Dataset, names: list[str], every: int) -> tuple[Ranges, NDArray[np.bool_]]:
     """Return ranges (N, turns, rows, columns), and which queries (N,) measure anything."""
     grid: ViewGrid = bundle.grid
     rows, usable = [], []

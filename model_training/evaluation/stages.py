@@ -22,7 +22,7 @@ from service.maps.calibration import RIGHT_M
 from service.registration.kernel import STATE, QueryPoints
 from service.registration.points import blocks_of, points_from
 from service.registration.register import RegistrationSettings, Start, register, registered_of, score
-from service.registration.surfel_map import SurfelMap
+from service.registration.surfel_tiles import Cloud
 from service.retrieval.knn import distinct_places
 from service.retrieval.retrieve import RANKED, Frame
 from service.retrieval.starts import starts_from
@@ -140,7 +140,7 @@ def stages_of(
     return found
 
 
-def _stages(localizer: Localizer, cloud: SurfelMap, asked: QueryFrame, truth: Transform) -> QueryStages:
+def _stages(localizer: Localizer, cloud: Cloud, asked: QueryFrame, truth: Transform) -> QueryStages:
     try:
         frame = localizer.look_up(asked.query(localizer.bundle.grid))
     except NoDepthError:
@@ -227,7 +227,7 @@ def _nearest(poses: Iterator[tuple[Rotation, np.ndarray]], truth: Transform, hea
     return min(away, default=np.inf)
 
 
-def _from_truth(localizer: Localizer, cloud: SurfelMap, frame: Frame, truth: Transform) -> tuple[float, float, float]:
+def _from_truth(localizer: Localizer, cloud: Cloud, frame: Frame, truth: Transform) -> tuple[float, float, float]:
     """Register from the true pose; return the distance that it moves (metres) and the share of inliers before and after."""
     settings = localizer.refining
     rig_px_m = frame.query.focal_baseline_px_m
@@ -251,9 +251,7 @@ def _from_truth(localizer: Localizer, cloud: SurfelMap, frame: Frame, truth: Tra
     return float(np.hypot(*(T_map_camera[:2, 3] - truth[:2, 3]))), at_truth, best.inliers
 
 
-def _inliers(
-    cloud: SurfelMap, points: QueryPoints, at: Start, height_m: float, settings: RegistrationSettings
-) -> float:
+def _inliers(cloud: Cloud, points: QueryPoints, at: Start, height_m: float, settings: RegistrationSettings) -> float:
     state = np.zeros(1, STATE)
     state["R"], state["up"] = at.R_map_level, at.R_map_level[:, 2]
     state["t"] = state["anchor"] = at.camera_m - cloud.origin_m

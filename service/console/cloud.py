@@ -8,12 +8,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from service.maps.reader import MapBundle
+from service.maps.map import Map
 from service.registration.surfel_map import SurfelMap
+from service.registration.surfel_tiles import Cloud
 
 #: ``points`` is rounded down to one of these, so that few clouds are computed and kept.
 LEVELS = (20_000, 50_000, 100_000, 200_000, 500_000, 1_000_000, 2_000_000)
 _KEPT = 2
+#: Largest number of tiles of a tiled map that are drawn. Each one is read from the disk.
+MOST_TILES = 64
 CLOUD_MAGIC, PLACES_MAGIC = b"SFC1", b"SFP1"
 #: x, y, z in steps of the header, and how upright the surface is: 0 flat ground, 65535 a wall.
 _POINT = np.dtype([("xyz", "<u2", (3,)), ("upright", "<u2")])
@@ -28,7 +31,7 @@ class Clouds:
         self._made: OrderedDict[tuple[str, str, int], bytes] = OrderedDict()
         self._making = threading.Lock()
 
-    def of(self, bundle: MapBundle, points: int) -> bytes:
+    def of(self, bundle: Map, points: int) -> bytes:
         """Return ``cloud_bytes`` of a map, from the cache if possible.
 
         Args:
@@ -46,7 +49,7 @@ class Clouds:
             return self._made[name]
 
 
-def cloud_bytes(cloud: SurfelMap | None, most: int) -> bytes:
+def cloud_bytes(cloud: Cloud | None, most: int) -> bytes:
     """Return the points of a cloud, thinned evenly over the ground. Any first part of them is a thinner cloud.
 
     Format: ``SFC1``, count (uint32), origin and step (float64 x 3 each, metres, map frame), then one ``_POINT`` per point. All numbers
@@ -56,17 +59,32 @@ def cloud_bytes(cloud: SurfelMap | None, most: int) -> bytes:
         cloud: cloud of a map; None for a map without a cloud.
         most: most points.
     """
-    if cloud is None or not len(cloud.surfels):
+    parts = _drawn_parts(cloud)
+    if not any(len(part.surfels) for part in parts):
         return CLOUD_MAGIC + struct.pack("<I6d", 0, *(0.0,) * 3, *(1.0,) * 3)
-    rows = thinned(cloud.surfels, cloud.tiles, most)
-    rows = rows[np.random.default_rng(0).permutation(len(rows))]
-    chosen = cloud.surfels[rows]
-    low = chosen["xyz"].min(axis=0).astype(np.float64)
-    step = np.maximum((chosen["xyz"].max(axis=0) - low) / _STEPS, 1e-6)
+    origin_m, xyz, upright = parts[0].origin_m, [], []
+    for part in parts:
+        chosen = part.surfels[thinned(part.surfels, part.tiles, most // len(parts))]
+        xyz.append(chosen["xyz"] if part is parts[0] else chosen["xyz"] + (part.origin_m - origin_m))
+        upright.append(_STEPS * (1.0 - np.clip(np.abs(chosen["normal"][:, 2]), 0, 1)))
+    positions = np.concatenate(xyz)
+    rows = np.random.default_rng(0).permutation(len(positions))
+    low = positions.min(axis=0).astype(np.float64)
+    step = np.maximum((positions.max(axis=0) - low) / _STEPS, 1e-6)
     packed = np.empty(len(rows), _POINT)
-    packed["xyz"] = np.clip(np.rint((chosen["xyz"] - low) / step), 0, _STEPS)
-    packed["upright"] = np.rint(_STEPS * (1.0 - np.clip(np.abs(chosen["normal"][:, 2]), 0, 1)))
-    return CLOUD_MAGIC + struct.pack("<I6d", len(rows), *(cloud.origin_m + low), *step) + packed.tobytes()
+    packed["xyz"] = np.clip(np.rint((positions[rows] - low) / step), 0, _STEPS)
+    packed["upright"] = np.rint(np.concatenate(upright)[rows])
+    return CLOUD_MAGIC + struct.pack("<I6d", len(rows), *(origin_m + low), *step) + packed.tobytes()
+
+
+def _drawn_parts(cloud: Cloud | None) -> list[SurfelMap]:
+    """Return the surfel maps to draw. A tiled map shows at most ``MOST_TILES`` tiles, evenly chosen."""
+    if cloud is None:
+        return []
+    if isinstance(cloud, SurfelMap):
+        return [cloud]
+    numbers = range(len(cloud.squares_m))
+    return [cloud.cloud_of(number) for number in numbers[:: -(-len(numbers) // MOST_TILES)]]
 
 
 def thinned(surfels: NDArray[Any], tiles: NDArray[np.float64], most: int) -> NDArray[np.intp]:
@@ -106,7 +124,7 @@ def _spacing_m(surfels: NDArray[Any], tiles: NDArray[np.float64]) -> float:
     return 1.0
 
 
-def places_bytes(bundle: MapBundle) -> bytes:
+def places_bytes(bundle: Map) -> bytes:
     """Return the places of the survey.
 
     Format: ``SFP1``, count (uint32), origin (float64 x 3, metres, map frame), then one ``_PLACE`` per place, all little-endian.

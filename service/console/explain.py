@@ -14,7 +14,7 @@ from service.imaging.fusion import picture_of
 from service.imaging.gather import gather
 from service.imaging.view_grid import ViewGrid
 from service.localization.refine import RefineSettings
-from service.maps.reader import MapBundle
+from service.maps.map import Map
 from service.registration.kernel import render
 from service.registration.register import Registered
 from service.registration.surfel_map import TILE_M, SurfelMap
@@ -75,9 +75,10 @@ def explain(engine: Engine, encoded: EncodedQuery) -> Explanation:
     drawn = {"depth": depth_picture(_small(depth_m)), "fused": _fused(frame, bundle.grid)}
     if bundle.cloud is not None:
         best = answer.neighbours[0]
-        drawn["view"] = _map_view(bundle, bundle.cloud, best.position_m, best.heading_rad)
+        drawn["view"] = _map_view(bundle, bundle.cloud.at(best.position_m), best.position_m, best.heading_rad)
         drawn["map_depth"] = enlarged(
-            depth_picture(_drawn_map(bundle.cloud, T_map_camera, _scaled(frame.query))), _WIDTH // _MAP_WIDTH
+            depth_picture(_drawn_map(bundle.cloud.at(T_map_camera[:3, 3]), T_map_camera, _scaled(frame.query))),
+            _WIDTH // _MAP_WIDTH,
         )
     origin_m = np.round(T_map_camera[:3, 3])
     return Explanation(
@@ -112,7 +113,7 @@ def _fused(frame: Frame, grid: ViewGrid) -> NDArray[np.uint8]:
 
 
 def _map_view(
-    bundle: MapBundle, cloud: SurfelMap, position_m: Float64[NDArray[np.float64], "3"], heading_rad: float
+    bundle: Map, cloud: SurfelMap, position_m: Float64[NDArray[np.float64], "3"], heading_rad: float
 ) -> NDArray[np.uint8]:
     """Return an image of the map on the view grid, rendered from the cloud at a position and heading."""
     T_map_camera = transform_from(rotation_z(heading_rad) @ R_BODY_OPTICAL, position_m)

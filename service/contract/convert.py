@@ -29,7 +29,7 @@ from service.imaging.level import GivenHeight
 from service.localization.answer import Answer
 from service.localization.belief import Belief
 from service.localization.localizer import Localizer
-from service.maps.reader import MapBundle
+from service.maps.map import Map
 from service.option_limits import LEAST_HEIGHT_M, MOST_HEIGHT_M, VEHICLE_HEIGHT_STD_M
 from service.retrieval.knn import Neighbour
 from service.retrieval.prior import POSITION_STD_M, Prior
@@ -279,7 +279,7 @@ def _calibration_range(answer: Answer) -> Literal["in_range", "extrapolated"] | 
     return "extrapolated" if answer.extrapolated else "in_range"
 
 
-def geopose_of(T_map_body: NDArray[np.float64], bundle: MapBundle) -> schema.GeoPose | None:
+def geopose_of(T_map_body: NDArray[np.float64], bundle: Map) -> schema.GeoPose | None:
     """Convert a pose in the map frame to a GeoPose; None if the map is not georeferenced.
 
     Args:
@@ -326,7 +326,7 @@ def vector_from(position_m: NDArray[np.float64]) -> schema.Vector:
     return _vector(position_m)
 
 
-def map_entry_from(bundle: MapBundle, versions: Sequence[Localizer]) -> schema.MapEntry:
+def map_entry_from(bundle: Map, versions: Sequence[Localizer]) -> schema.MapEntry:
     """Convert a mounted map to the contract.
 
     Args:
@@ -484,7 +484,7 @@ def transform_of(transform: schema.RigidTransform, name: str) -> NDArray[np.floa
     return transform_from(rotation_from_quaternion_xyzw(quaternion), np.array([p.x, p.y, p.z]))
 
 
-def _street(answer: Answer, bundle: MapBundle) -> schema.Street | None:
+def _street(answer: Answer, bundle: Map) -> schema.Street | None:
     if answer.vote is None or bundle.streets is None or answer.street < 0:
         return None
     street = bundle.streets[answer.street]
@@ -518,7 +518,7 @@ def _pose(T: NDArray[np.float64], heading_rad: float, covariance: NDArray[np.flo
     )
 
 
-def _neighbour(neighbour: Neighbour, bundle: MapBundle) -> schema.Neighbour:
+def _neighbour(neighbour: Neighbour, bundle: Map) -> schema.Neighbour:
     named = bundle.streets is not None and neighbour.street >= 0
     return schema.Neighbour(
         place=neighbour.place,

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float64
 from numpy.typing import NDArray
 
-from service.maps.reader import MapBundle
+from service.maps.map import Map
 
 #: Edge of a cell, and largest distance of a robot from a place. Retrieval finds a robot 2 m and slightly more beside a survey's lane.
 CELL_M, REACH_M = 5.0, 7.5
@@ -16,7 +16,7 @@ _MOST_MADE = 64
 _made: dict[tuple[str, str], bytes] = {}
 
 
-def coverage_geojson(bundles: Sequence[MapBundle]) -> bytes:
+def coverage_geojson(bundles: Sequence[Map]) -> bytes:
     """Return a FeatureCollection with one MultiPolygon per map: the cells near its places.
 
     Coordinates are longitude and latitude (RFC 7946) if the map is georeferenced, else metres of the map frame. The property
@@ -28,7 +28,7 @@ def coverage_geojson(bundles: Sequence[MapBundle]) -> bytes:
     return b'{"type": "FeatureCollection", "features": [' + b", ".join(_feature(bundle) for bundle in bundles) + b"]}"
 
 
-def _feature(bundle: MapBundle) -> bytes:
+def _feature(bundle: Map) -> bytes:
     """Return the feature of a map, computed once per version. A large map takes seconds."""
     name = (str(bundle.path), bundle.manifest.version)
     if name not in _made:
@@ -38,7 +38,7 @@ def _feature(bundle: MapBundle) -> bytes:
     return _made[name]
 
 
-def _made_feature(bundle: MapBundle) -> dict[str, Any]:
+def _made_feature(bundle: Map) -> dict[str, Any]:
     rings = [_ring(rectangle, bundle) for rectangle in covered(bundle.T_map_place[:, :2, 3])]
     return {
         "type": "Feature",
@@ -80,7 +80,7 @@ def covered(places_m: Float64[NDArray[np.float64], "P 2"]) -> list[tuple[float, 
     ]
 
 
-def _ring(rectangle: tuple[float, float, float, float], bundle: MapBundle) -> list[list[float]]:
+def _ring(rectangle: tuple[float, float, float, float], bundle: Map) -> list[list[float]]:
     """Return the closed ring of a rectangle, counter-clockwise."""
     x0, y0, x1, y1 = rectangle
     corners = [(x0, y0), (x1, y0), (x1, y1), (x0, y1), (x0, y0)]

@@ -5,10 +5,11 @@ from pathlib import Path
 from service.doctor.finding import Finding
 from service.errors import StreetfixError
 from service.localization.localizer import Localizer
-from service.maps.reader import MapBundle
+from service.maps.map import Map
+from service.maps.tiles import open_map
 
 
-def check_bundle(path: Path) -> tuple[Finding, MapBundle | None]:
+def check_bundle(path: Path) -> tuple[Finding, Map | None]:
     """Check that a bundle opens and that its files have the hashes of its manifest.
 
     Args:
@@ -18,7 +19,7 @@ def check_bundle(path: Path) -> tuple[Finding, MapBundle | None]:
         The finding, and the bundle if it opens.
     """
     try:
-        bundle = MapBundle.open(path, verify=True)
+        bundle = open_map(path)
     except StreetfixError as error:
         return Finding.of_error("map", error), None
     manifest = bundle.manifest
@@ -29,7 +30,7 @@ def check_bundle(path: Path) -> tuple[Finding, MapBundle | None]:
     return Finding("map", "ok", text), bundle
 
 
-def check_encoder(bundle: MapBundle) -> tuple[Finding, Localizer | None]:
+def check_encoder(bundle: Map) -> tuple[Finding, Localizer | None]:
     """Check that the encoder of a map runs, and that it belongs to the map's descriptors.
 
     Args:
@@ -47,7 +48,7 @@ def check_encoder(bundle: MapBundle) -> tuple[Finding, Localizer | None]:
     return Finding("encoder", "ok", text), localizer
 
 
-def check_calibration(bundle: MapBundle, false_accept_rate: float) -> Finding:
+def check_calibration(bundle: Map, false_accept_rate: float) -> Finding:
     """Check that the map is calibrated, and that its calibration can promise the false-accept rate of the service.
 
     Args:
@@ -75,7 +76,7 @@ def check_calibration(bundle: MapBundle, false_accept_rate: float) -> Finding:
     return Finding("calibration", "ok", f"the map is calibrated, {site}{rig}")
 
 
-def check_cloud(bundle: MapBundle) -> Finding:
+def check_cloud(bundle: Map) -> Finding:
     """Check that the map has a cloud to register images on.
 
     Args:
@@ -88,10 +89,10 @@ def check_cloud(bundle: MapBundle) -> Finding:
             "the map has no cloud: an answer is the pose of a place, without registration and confidence",
             "build the map again with its cloud",
         )
-    return Finding("cloud", "ok", f"{len(bundle.cloud.surfels)} surfels")
+    return Finding("cloud", "ok", f"{bundle.manifest.counts.cloud_points} surfels")
 
 
-def check_streets(bundle: MapBundle) -> Finding:
+def check_streets(bundle: Map) -> Finding:
     """Check that the map knows its streets.
 
     Args:

@@ -11,14 +11,14 @@ from service.imaging.gather import gather
 from service.imaging.level import level_query
 from service.localization.answer import Answer
 from service.localization.localizer import Localizer
-from service.maps.reader import MapBundle
+from service.maps.map import Map
 from service.runtime.engine import query_in
 
 #: Share of the camera's rows that the LiDAR must see.
 LEAST_OVERLAP = 0.5
 
 
-def rows_of_camera(pair: Pair, bundle: MapBundle) -> Bool[NDArray[np.bool_], " rows"]:
+def rows_of_camera(pair: Pair, bundle: Map) -> Bool[NDArray[np.bool_], " rows"]:
     """Return the rows of the view grid that the camera sees in at least half of the columns that the camera sees at all.
 
     Args:

@@ -11,7 +11,7 @@ from service.confidence.spread import Extent
 from service.geometry.rigid import Transform, inverse, transform_from
 from service.imaging.query_view import QueryViews
 from service.localization.answer import Answer, Timings, require_finite
-from service.maps.reader import MapBundle
+from service.maps.map import Map
 from service.retrieval.hypotheses import Hypothesis
 from service.retrieval.knn import Neighbour
 from service.retrieval.retrieve import Frame, Retrieved
@@ -39,7 +39,7 @@ class Found:
     decision: Decision | None
 
 
-def compose(bundle: MapBundle, frames: tuple[Frame, ...], found: Found, extent: Extent, timer: StageTimer) -> Answer:
+def compose(bundle: Map, frames: tuple[Frame, ...], found: Found, extent: Extent, timer: StageTimer) -> Answer:
     """Build an answer from the results of all stages.
 
     Args:
@@ -98,7 +98,7 @@ def _timings(timer: StageTimer, *, registered: bool) -> Timings:
     )
 
 
-def _street_of(bundle: MapBundle, T_map_camera: Transform, heaviest: Hypothesis, *, registered: bool) -> int:
+def _street_of(bundle: Map, T_map_camera: Transform, heaviest: Hypothesis, *, registered: bool) -> int:
     """Return the street under a registered position, else the street of the heaviest cluster; -1 for none.
 
     A cluster never spans two streets. The vote of the nearest places crosses street borders more often (decision 0084).
@@ -108,7 +108,7 @@ def _street_of(bundle: MapBundle, T_map_camera: Transform, heaviest: Hypothesis,
     return bundle.streets.index_at(T_map_camera[:2, 3]) if registered else heaviest.street
 
 
-def _pose_of(bundle: MapBundle, hypothesis: Hypothesis, views: QueryViews) -> Transform:
+def _pose_of(bundle: Map, hypothesis: Hypothesis, views: QueryViews) -> Transform:
     """Return T_map_camera at a hypothesis. The position of a hypothesis is at LiDAR height, so it is moved to camera height."""
     above_lidar_m = views.height_m - bundle.manifest.lidar_height_m
     position_m = hypothesis.position_m + np.array([0.0, 0.0, above_lidar_m])

@@ -3,6 +3,8 @@
 from dataclasses import replace
 
 import numpy as np
+from jaxtyping import Float64
+from numpy.typing import NDArray
 
 from service.confidence.decision import decision_of, require_promise
 from service.confidence.features import evidence_of, require_features
@@ -11,7 +13,7 @@ from service.geometry.rigid import Transform
 from service.localization.answer import Answer
 from service.localization.compose import Found, compose
 from service.localization.refine import RefineSettings, refine
-from service.maps.reader import MapBundle
+from service.maps.map import Map
 from service.retrieval.encoder import Encoder, Provider
 from service.retrieval.hypotheses import ClusterSettings
 from service.retrieval.query import Query
@@ -35,7 +37,7 @@ class Localizer:
 
     def __init__(
         self,
-        bundle: MapBundle,
+        bundle: Map,
         encoder: Encoder,
         *,
         clusters: ClusterSettings | None = None,
@@ -48,7 +50,7 @@ class Localizer:
         self.extent = Extent.of_places(bundle.T_map_place[:, :3, 3], bundle.manifest.spacing_m)
 
     @classmethod
-    def open(cls, bundle: MapBundle, *, provider: Provider = "cpu") -> "Localizer":
+    def open(cls, bundle: Map, *, provider: Provider = "cpu") -> "Localizer":
         """Create a localizer with the encoder that the bundle contains.
 
         Args:
@@ -132,7 +134,8 @@ class Localizer:
         Raises:
             RequestError: the calibration does not support such a low false-accept rate.
         """
-        bundle, query = self.bundle, frames[0].query
+        query = frames[0].query
+        bundle = self.bundle.around(_positions_m(frames, predicted))  # of a tiled map, the tiles of this query
         cloud = bundle.cloud if query.refine else None
         require_promise(bundle.calibration if query.refine else None, query)
         # 1. Retrieval: the most similar places, clusters of the views, and the paper's K-NN vote over the streets.
@@ -161,3 +164,9 @@ class Localizer:
         """
         # 5. Reasons and spread if the answer is not LOCALIZED. Then the answer, and a check that all its numbers are finite.
         return compose(self.bundle, frames, found, self.extent, timer)
+
+
+def _positions_m(frames: tuple[Frame, ...], predicted: tuple[Transform, ...]) -> Float64[NDArray[np.float64], "n 3"]:
+    """Return the positions around which a query is registered, map frame, m: predicted ones, then those of the similar views."""
+    similar = np.concatenate([frame.matches.T_map_place[:, :3, 3] for frame in frames])
+    return np.concatenate([np.array([T[:3, 3] for T in predicted]).reshape(-1, 3), similar])

@@ -7,7 +7,7 @@ from jaxtyping import Float64
 from numpy.typing import NDArray
 
 from service.geometry.rigid import Transform, heading_of_camera, transform_from
-from service.maps.reader import MapBundle
+from service.maps.map import Map
 from service.registration.covariance import (
     OF_POINTS,
     OF_RAYS,
@@ -87,7 +87,7 @@ OFFSET_PX = 0.6
 
 
 def refine(
-    bundle: MapBundle,
+    bundle: Map,
     cloud: Cloud,
     frames: tuple[Frame, ...],
     prior: Prior | None,
@@ -176,7 +176,7 @@ def refine(
 
 
 def _starts_at(
-    bundle: MapBundle,
+    bundle: Map,
     measured: tuple[MeasuredFrame, ...],
     reference: Frame,
     predicted: tuple[Transform, ...],

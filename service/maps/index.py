@@ -6,7 +6,7 @@ A large map has an index file instead of the copy (``inverted_file``).
 """
 
 from pathlib import Path
-from typing import Protocol, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
 import faiss
 import numpy as np
@@ -95,6 +95,25 @@ def vectors_of(numbers: Int8[NDArray[np.int8], "n D"]) -> Descriptors:
 
 
 @runtime_checkable
+class Rows(Protocol):
+    """The 8-bit descriptors of all views, a row per view: an array, or something that computes the rows that are read."""
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """Number of views, and number of components."""
+
+    def __len__(self) -> int:
+        """Return the number of views."""
+
+    def __getitem__(self, views: Any, /) -> NDArray[np.int8]:
+        """Return the rows of some views.
+
+        Args:
+            views: a slice, or the numbers of the views.
+        """
+
+
+@runtime_checkable
 class Shortlister(Protocol):
     """Finds views that may be similar to a query, much faster than an exact comparison with all of them."""
 
@@ -116,12 +135,12 @@ class ScannedCopy:
         numbers: 8-bit descriptors, a row per view.
     """
 
-    def __init__(self, numbers: Int8[NDArray[np.int8], "n D"]) -> None:
+    def __init__(self, numbers: Rows) -> None:
         size = numbers.shape[1]
         if len(numbers) < _FEWEST:
             self._copy: faiss.Index = faiss.IndexFlatIP(size)
             self._mean = np.zeros(size, np.float32)
-            self._copy.add(vectors_of(numbers))
+            self._copy.add(vectors_of(numbers[:]))
             return
         axes = faiss.PCAMatrix(size, min(_AXES, size))
         codes = faiss.IndexScalarQuantizer(
@@ -154,7 +173,7 @@ class ViewIndex:
         shortlister: makes the shortlists; None makes a coarse copy for them.
     """
 
-    def __init__(self, numbers: Int8[NDArray[np.int8], "n D"], shortlister: Shortlister | None = None) -> None:
+    def __init__(self, numbers: Rows, shortlister: Shortlister | None = None) -> None:
         self._numbers = numbers
         self._shortlister = shortlister or ScannedCopy(numbers)
 
@@ -176,6 +195,11 @@ class ViewIndex:
 
     def __len__(self) -> int:
         return len(self._numbers)
+
+    @property
+    def rows(self) -> Rows:
+        """The 8-bit descriptors, a row per view."""
+        return self._numbers
 
     @property
     def dimension(self) -> int:

@@ -9,7 +9,7 @@ import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, Protocol, runtime_checkable
+from typing import Any
 
 import faiss
 import numpy as np
@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from service.errors import BundleError
 from service.maps import index
-from service.maps.index import Shortlister, vectors_of
+from service.maps.index import Rows, Shortlister, vectors_of
 
 FILE = "search.faiss"
 #: Smallest number of views for this file. For fewer, a scan is exact and takes at most 1 ms longer (decision 0158).
@@ -52,25 +52,6 @@ _REMEDY = "copy or build the bundle again"
 _Asked = Float32[NDArray[np.float32], "q D"]
 #: FAISS without its type stubs, which lack many of the classes and fields that this file uses.
 _faiss: Any = faiss
-
-
-@runtime_checkable
-class Rows(Protocol):
-    """The 8-bit descriptors of all views, a row per view: an array, or something that computes the rows that are read."""
-
-    @property
-    def shape(self) -> tuple[int, ...]:
-        """Number of views, and number of components."""
-
-    def __len__(self) -> int:
-        """Return the number of views."""
-
-    def __getitem__(self, views: Any, /) -> NDArray[np.int8]:
-        """Return the rows of some views.
-
-        Args:
-            views: a slice, or the numbers of the views.
-        """
 
 
 def write_inverted_file(path: Path, numbers: Rows, *, headings: int) -> float:
@@ -162,6 +143,17 @@ class InvertedFile:
         """
         found = self._by_codes(descriptor, k)
         return np.union1d(found, self._neighbours(found[: -(-k // _BRING)]))
+
+    def most_similar(self, descriptor: Float32[NDArray[np.float32], " D"], k: int) -> Int64[NDArray[np.int64], " n"]:
+        """Return the indices of about the k most similar views, the most similar first.
+
+        The codes of the views decide, without an exact comparison.
+
+        Args:
+            descriptor: descriptor of the query view.
+            k: length of the list, at most the number of views.
+        """
+        return self._by_codes(descriptor, k)
 
     def _by_codes(self, descriptor: Float32[NDArray[np.float32], " D"], k: int) -> Int64[NDArray[np.int64], " n"]:
         """Return the k most similar views by their codes, the best first. Fewer only if the graph does not lead to all lists."""

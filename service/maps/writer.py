@@ -43,14 +43,14 @@ def write_bundle(out: Path, content: BundleContent, *, overwrite: bool = False) 
     if out.exists() and not overwrite:
         raise BundleError(f"{out}: already exists; choose another --out or pass --overwrite")
     _require_valid(content)
-    with _in_place(out, f"{out}: the bundle cannot be written", "free disk space or choose another folder") as partial:
+    with in_place(out, f"{out}: the bundle cannot be written", "free disk space or choose another folder") as partial:
         made = _write_files(partial, content)
         partial.chmod(0o755)
     return made
 
 
 @contextmanager
-def _in_place(out: Path, what: str, remedy: str) -> Iterator[Path]:
+def in_place(out: Path, what: str, remedy: str) -> Iterator[Path]:
     """Yield a folder beside ``out``, and rename it to ``out`` at the end. A failure removes it and leaves ``out`` as it is.
 
     Args:
@@ -66,7 +66,7 @@ def _in_place(out: Path, what: str, remedy: str) -> Iterator[Path]:
         out.parent.mkdir(parents=True, exist_ok=True)
         partial = Path(tempfile.mkdtemp(prefix=f".{out.name}.", suffix=".partial", dir=out.parent))
         yield partial
-        _sync(partial)
+        sync(partial)
         _put_in_place(partial, out)
     except OSError as error:
         raise BundleError(f"{what} ({error.strerror}); {remedy}") from error
@@ -91,31 +91,37 @@ def replace_calibration(bundle: Path, calibration: Mapping[str, Any]) -> Manifes
     """
     old, place = manifest.read_manifest(bundle), bundle.resolve()
     remedy = f"free disk space, or get write access to {place.parent}"
-    with _in_place(place, f"{bundle}: the calibration cannot be replaced", remedy) as partial:
+    with in_place(place, f"{bundle}: the calibration cannot be replaced", remedy) as partial:
         for name in sorted(old.files):
             (partial / name).parent.mkdir(exist_ok=True, parents=True)
             if name != parts.CALIBRATION_FILE:
-                _link_or_copy(place / name, partial / name)
+                link_or_copy(place / name, partial / name)
         written = partial / parts.CALIBRATION_FILE
-        written.write_bytes(_json(calibration))
-        _sync(written)
+        written.write_bytes(json_bytes(calibration))
+        sync(written)
         entry = FileEntry(sha256=sha256_of(written), size=written.stat().st_size)
         files = {**old.files, parts.CALIBRATION_FILE: entry}
         made = old.model_copy(update={"files": files, "made_at": datetime.now(UTC)}).stamped()
         (partial / manifest.FILE).write_bytes(made.to_bytes())
-        _sync(partial / manifest.FILE)
+        sync(partial / manifest.FILE)
         for folder in {(partial / name).parent for name in old.files}:
-            _sync(folder)
+            sync(folder)
         shutil.copymode(place, partial)
     return made
 
 
-def _link_or_copy(source: Path, target: Path) -> None:
+def link_or_copy(source: Path, target: Path) -> None:
+    """Create a hard link to a file, or a copy where the file system has no links.
+
+    Args:
+        source: the file.
+        target: the new file.
+    """
     try:
         os.link(source.resolve(), target)
     except OSError:  # a file system without hard links; a copy fails with its own error if the disk is the reason
         shutil.copyfile(source, target)
-        _sync(target)
+        sync(target)
 
 
 def _write_files(folder: Path, content: BundleContent) -> Manifest:
@@ -129,12 +135,12 @@ def _write_files(folder: Path, content: BundleContent) -> Manifest:
         index.FILE: lambda path: index.write_descriptors(path, content.descriptors),
         parts.PLACES_FILE: lambda path: np.save(path, places, allow_pickle=False),
         parts.VIEWS_FILE: lambda path: np.save(path, views, allow_pickle=False),
-        parts.CALIBRATION_FILE: lambda path: path.write_bytes(_json(content.calibration)),
+        parts.CALIBRATION_FILE: lambda path: path.write_bytes(json_bytes(content.calibration)),
     }
     if content.preview_webp:
         writers[parts.PREVIEW_FILE] = lambda path: path.write_bytes(content.preview_webp)
     if content.streets is not None:
-        writers[streets.FILE] = lambda path: path.write_bytes(_json(content.streets))
+        writers[streets.FILE] = lambda path: path.write_bytes(json_bytes(content.streets))
     if content.statistics is not None:
         writers[parts.STATISTICS_FILE] = partial(write_records, records=content.statistics)
     for name, array in ({} if content.cloud is None else content.cloud.arrays()).items():
@@ -149,11 +155,11 @@ def _write_files(folder: Path, content: BundleContent) -> Manifest:
         writers[inverted_file.FILE] = write_index
     for name, write in writers.items():
         write(folder / name)
-        _sync(folder / name)
-    _sync(folder / parts.CLOUD_FOLDER)
+        sync(folder / name)
+    sync(folder / parts.CLOUD_FOLDER)
     made = _manifest_of(folder, content, sorted(writers), measured)
     (folder / manifest.FILE).write_bytes(made.to_bytes())
-    _sync(folder / manifest.FILE)
+    sync(folder / manifest.FILE)
     return made
 
 
@@ -161,7 +167,12 @@ def _array_writer(array: NDArray[Any]) -> Callable[[Path], None]:
     return lambda path: np.save(path, array, allow_pickle=False)
 
 
-def _json(document: object) -> bytes:
+def json_bytes(document: object) -> bytes:
+    """Return a JSON document as a bundle stores it.
+
+    Args:
+        document: the document; all numbers finite.
+    """
     return (json.dumps(document, sort_keys=True, allow_nan=False) + "\n").encode()
 
 
@@ -245,8 +256,12 @@ def sha256_of(path: Path) -> str:
         return hashlib.file_digest(stream, "sha256").hexdigest()
 
 
-def _sync(path: Path) -> None:
-    """Flush a file or folder to the disk, so that the content is there before a later rename."""
+def sync(path: Path) -> None:
+    """Flush a file or folder to the disk, so that the content is there before a later rename.
+
+    Args:
+        path: the file or folder.
+    """
     descriptor = os.open(path, os.O_RDONLY)
     try:
         os.fsync(descriptor)
@@ -268,4 +283,4 @@ def _put_in_place(partial: Path, out: Path) -> None:
             raise
         finally:
             shutil.rmtree(aside, ignore_errors=True)
-    _sync(out.parent)
+    sync(out.parent)

@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float32, Float64, Int32, Int64
 from numpy.typing import NDArray
 
-from service.maps.reader import MapBundle
+from service.maps.map import Map
 
 #: Length of the shortlist, as a multiple of the number of views wanted. Decision 0046 says what a shorter list loses.
 SHORTLIST = 6
@@ -58,7 +58,7 @@ class Neighbour:
 
 
 def search_views(
-    bundle: MapBundle,
+    bundle: Map,
     descriptors: Float32[NDArray[np.float32], "T D"],
     *,
     turns_rad: tuple[float, ...],
@@ -78,7 +78,7 @@ def search_views(
         places: number of distinct places to find, if the map has as many.
         fewest: smallest number of views to find.
     """
-    wanted = min(places, bundle.manifest.counts.places)
+    wanted = min(places, len(bundle.places))
     count = max(fewest, 4 * wanted)
     while True:
         shortlist = bundle.view_index.shortlist(descriptors.mean(axis=0), SHORTLIST * count)
@@ -89,7 +89,7 @@ def search_views(
 
 
 def _most_similar(
-    bundle: MapBundle,
+    bundle: Map,
     descriptors: Float32[NDArray[np.float32], "T D"],
     views: Int64[NDArray[np.int64], " n"],
     turns_rad: Float64[NDArray[np.float64], " T"],
@@ -104,7 +104,7 @@ def _most_similar(
 
 
 def _matches(
-    bundle: MapBundle,
+    bundle: Map,
     similarity: Float32[NDArray[np.float32], " n"],
     view: Int64[NDArray[np.int64], " n"],
     turn_rad: Float64[NDArray[np.float64], " n"],
@@ -113,7 +113,7 @@ def _matches(
     return ViewMatches(
         view=view,
         similarity=similarity.astype(np.float64),
-        place=place,
+        place=bundle.numbers_of(place),
         street=np.array(bundle.place_street[place]),
         heading_rad=np.array(bundle.view_heading_rad[view]) - turn_rad,
         T_map_place=np.array(bundle.T_map_place[place]),

@@ -3,14 +3,14 @@
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float32
+from jaxtyping import Float32, Float64
 from numpy.typing import NDArray
 
 from service.errors import BundleError
 from service.geometry.rigid import Rotation, Transform, transform_from
 from service.imaging.query_view import QueryViews, query_views
 from service.imaging.view_grid import ViewGrid
-from service.maps.reader import MapBundle
+from service.maps.map import Map
 from service.registration.points import inverse_depth_noise
 from service.retrieval.encoder import Encoder
 from service.retrieval.hypotheses import ClusterSettings, Hypothesis, cluster, rerank_with_prior
@@ -21,6 +21,9 @@ from service.timing import StageTimer
 #: A query is searched at three turns, 5 degrees apart. The views of a place are 15 degrees apart, so one of the turns is within
 #: 2.5 degrees of a map view.
 TURN_RAD = float(np.deg2rad(5.0))
+
+#: Radius of the area of a prior: so many of its standard deviations, and a view's reach beyond (m).
+NEAR_SIGMAS, NEAR_M = 4.0, 50.0
 
 #: Smallest number of distinct places to find. Registration starts from several of them.
 RANKED = 40
@@ -81,7 +84,7 @@ class Retrieved:
     vote: StreetVote | None
 
 
-def look_up(bundle: MapBundle, encoder: Encoder, query: Query, clusters: ClusterSettings, timer: StageTimer) -> Frame:
+def look_up(bundle: Map, encoder: Encoder, query: Query, clusters: ClusterSettings, timer: StageTimer) -> Frame:
     """Encode one image pair and search the map for similar views.
 
     Args:
@@ -112,8 +115,9 @@ def look_up(bundle: MapBundle, encoder: Encoder, query: Query, clusters: Cluster
     with timer.stage("encode"):
         descriptors = encoder.encode(views.planes, side="query")
     with timer.stage("search"):
+        part = bundle.searched(descriptors.mean(axis=0), near_prior(query))
         matches = search_views(
-            bundle, descriptors, turns_rad=views.turns_rad, places=places_of(query), fewest=clusters.views
+            part, descriptors, turns_rad=views.turns_rad, places=places_of(query), fewest=clusters.views
         )
         # A query without registration does not need the noise. But a later query of a stream may register this frame
         # (decision 0111).
@@ -121,7 +125,7 @@ def look_up(bundle: MapBundle, encoder: Encoder, query: Query, clusters: Cluster
     return Frame(query, np.eye(4), views, descriptors, matches, noise=noise.total, independent_noise=noise.independent)
 
 
-def retrieve(bundle: MapBundle, frame: Frame, clusters: ClusterSettings) -> Retrieved:
+def retrieve(bundle: Map, frame: Frame, clusters: ClusterSettings) -> Retrieved:
     """Rank the places, cluster the views and vote over the streets, as the paper does.
 
     Args:
@@ -146,6 +150,20 @@ def turns_on(grid: ViewGrid) -> tuple[int, ...]:
     return (-columns, 0, columns)
 
 
+def near_prior(query: Query) -> tuple[Float64[NDArray[np.float64], "2"], float] | None:
+    """Return x and y (m, map frame) and radius (m) of the area where the prior of a query expects the camera; None without a position.
+
+    A tiled map is searched there. The area is generous, so a prior that is worse than it says still finds its tile.
+
+    Args:
+        query: query with its options.
+    """
+    prior = query.prior
+    if prior is None or prior.position_m is None:
+        return None
+    return prior.position_m, NEAR_SIGMAS * prior.position_std_m + NEAR_M
+
+
 def places_of(query: Query) -> int:
     """Return how many distinct places to search for.
 
@@ -155,7 +173,7 @@ def places_of(query: Query) -> int:
     return max(query.neighbours, query.ranked, RANKED)
 
 
-def require_encoder_of(bundle: MapBundle, encoder: Encoder) -> None:
+def require_encoder_of(bundle: Map, encoder: Encoder) -> None:
     """Refuse an encoder that did not compute the descriptors of a map.
 
     Args:

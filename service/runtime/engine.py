@@ -15,7 +15,7 @@ from service.localization.answer import Answer
 from service.localization.localizer import Localizer
 from service.localization.track_bytes import packed, unpacked
 from service.localization.tracker import Track, follow
-from service.maps.reader import MapBundle
+from service.maps.map import Map
 from service.option_limits import NEIGHBOURS
 from service.retrieval.prior import Prior
 from service.retrieval.query import DepthFormat, Query, decoded_query
@@ -103,7 +103,7 @@ class Located:
     """An answer, the map bundle that gave it, and the sealed belief for a client that carries it."""
 
     answer: Answer
-    bundle: MapBundle
+    bundle: Map
     sealed_belief: bytes | None = None
 
 
@@ -295,7 +295,7 @@ class Engine:
         """Wait for running requests and drop waiting ones."""
         self.admission.close()
 
-    def _decode(self, encoded: EncodedQuery, bundle: MapBundle) -> Query:
+    def _decode(self, encoded: EncodedQuery, bundle: Map) -> Query:
         """Decode both images. Their memory stays reserved until the depth image is deleted."""
         converted = encoded.depth_kind == "range" or encoded.depth_encoding == "carla"
         of_pixel = {"rgb": RGB_PEAK, "depth": DEPTH_PEAK_CONVERTED if converted else DEPTH_PEAK}
@@ -342,7 +342,7 @@ def warm_up(false_accept_rate: float, localizer: Localizer) -> None:
 
 
 def query_in(
-    encoded: EncodedQuery, bundle: MapBundle, false_accept_rate: float, *, limits: ImageLimits = DEFAULT_LIMITS
+    encoded: EncodedQuery, bundle: Map, false_accept_rate: float, *, limits: ImageLimits = DEFAULT_LIMITS
 ) -> Query:
     """Decode both images, and return the query with its options.
 
@@ -375,7 +375,7 @@ def query_in(
     )
 
 
-def prior_in(encoded: EncodedQuery, bundle: MapBundle) -> Prior | None:
+def prior_in(encoded: EncodedQuery, bundle: Map) -> Prior | None:
     """Return the prior of a query in the map frame; None if there is none.
 
     Args:

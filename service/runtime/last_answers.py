@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from service.geometry.rigid import heading_of_camera
 from service.localization.answer import Answer, Status
-from service.maps.reader import MapBundle
+from service.maps.map import Map
 
 MOST = 200
 
@@ -57,7 +57,7 @@ class LastAnswers:
         self._kept: deque[LastAnswer] = deque(maxlen=MOST)
         self._numbers = count(1)
 
-    def add(self, answer: Answer, bundle: MapBundle, *, frames: int) -> None:
+    def add(self, answer: Answer, bundle: Map, *, frames: int) -> None:
         """Keep the figures of an answer.
 
         Args:

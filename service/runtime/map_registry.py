@@ -10,7 +10,7 @@ from service.errors import BundleError, NotReadyError, UnknownMapError
 from service.localization.localizer import Localizer
 from service.maps.manifest import FILE as MANIFEST_FILE
 from service.maps.manifest import Manifest, dataset_error
-from service.maps.reader import MapBundle
+from service.maps.tiles import open_map
 from service.retrieval.encoder import Provider
 from service.runtime.serving_table import Key, MapVersion, ServingTable, Table
 
@@ -103,7 +103,7 @@ class MapRegistry:
             raise BundleError(
                 f"{where}: {_NO_MANIFEST}" if paths else "no map bundle given; give a folder that build-map wrote"
             )
-        return cls([Localizer.open(MapBundle.open(path), provider=provider) for path in bundles], provider=provider)
+        return cls([Localizer.open(open_map(path), provider=provider) for path in bundles], provider=provider)
 
     def __len__(self) -> int:
         return len(self._maps())

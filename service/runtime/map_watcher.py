@@ -4,14 +4,14 @@ import logging
 import os
 import threading
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from service.errors import BundleError, StreetfixError
 from service.localization.localizer import Localizer
-from service.maps.manifest import Manifest, read_manifest
-from service.maps.reader import MapBundle
+from service.maps.manifest import TILES_FOLDER, Manifest, read_manifest
+from service.maps.tiles import open_map
 from service.runtime.map_registry import MapRegistry, Refused, bundle_paths, twin_error, version_of
 from service.runtime.serving_table import Key, MapVersion
 from service.runtime.wakeup import Wakeup
@@ -187,7 +187,7 @@ class MapWatcher:
     def _mount(self, bundle: _Bundle) -> StreetfixError | None:
         """Open, warm up and mount a bundle; return the error if that fails."""
         try:
-            localizer = Localizer.open(MapBundle.open(bundle.path), provider=self._registry.provider)
+            localizer = Localizer.open(open_map(bundle.path), provider=self._registry.provider)
             self._warm(localizer)
             self._registry.mount(localizer)
         except StreetfixError as error:
@@ -343,11 +343,18 @@ def stamp_of(path: Path) -> Stamp:
         path: of the folder.
     """
     files = []
-    # os.walk ignores folders that vanish meanwhile, such as those of a bundle that is being removed.
-    for file in (Path(folder) / name for folder, _, names in os.walk(path) for name in names):
+    # os.walk ignores folders that vanish meanwhile, such as those of a bundle that is being removed. The folder of a tile never changes.
+    for file in (Path(folder) / name for folder, _, names in _walk_without_tiles(path) for name in names):
         try:
             status = file.stat()
         except OSError:  # the file is being replaced
             continue
         files.append((file.relative_to(path).as_posix(), status.st_size, status.st_mtime_ns))
     return tuple(sorted(files))
+
+
+def _walk_without_tiles(path: Path) -> Iterator[tuple[str, list[str], list[str]]]:
+    for folder, folders, names in os.walk(path):
+        if Path(folder) == path and TILES_FOLDER in folders:
+            folders.remove(TILES_FOLDER)
+        yield folder, folders, names

@@ -16,7 +16,7 @@ from prometheus_client.process_collector import ProcessCollector
 from prometheus_client.registry import Collector
 
 from service.localization.answer import Answer, Timings
-from service.maps.reader import MapBundle
+from service.maps.map import Map
 from service.runtime.admission import Admission, MemoryBudget
 from service.runtime.map_registry import MOST_REFUSED, MapRegistry
 from service.timing import STAGES
@@ -107,7 +107,7 @@ class Metrics:
         """Add a gauge. With several processes its value is the sum over the living ones."""
         return Gauge(name, what, registry=self._registry, multiprocess_mode="livesum")
 
-    def answered(self, answer: Answer, bundle: MapBundle, *, frames: int) -> None:
+    def answered(self, answer: Answer, bundle: Map, *, frames: int) -> None:
         """Count an answer and its stages.
 
         Args:
@@ -124,7 +124,7 @@ class Metrics:
         for stage in STAGES:
             self._stage_seconds.labels(stage).observe(_milliseconds(answer.timings, stage) / 1e3)
 
-    def disrupted(self, bundle: MapBundle) -> None:
+    def disrupted(self, bundle: Map) -> None:
         """Count a rise of a track's epoch.
 
         Args:

@@ -4,7 +4,7 @@ import numpy as np
 from jaxtyping import Float32, Float64
 from numpy.typing import NDArray
 
-from service.maps.reader import MapBundle
+from service.maps.map import Map
 from service.registration.register import Registered
 from service.scoring.measured import MeasuredFrame
 from service.scoring.scorer import Scores
@@ -26,7 +26,7 @@ class SimilarityScorer:
 
     name = "similarity"
 
-    def __init__(self, bundle: MapBundle, measured: tuple[MeasuredFrame, ...]) -> None:
+    def __init__(self, bundle: Map, measured: tuple[MeasuredFrame, ...]) -> None:
         self._bundle, self._measured = bundle, measured
 
     def score(self, poses: tuple[Registered, ...]) -> Scores:
@@ -41,7 +41,7 @@ class SimilarityScorer:
 
 
 def similarity_of(
-    bundle: MapBundle, measured: tuple[MeasuredFrame, ...], T_map_level: Float64[NDArray[np.float64], "n 4 4"]
+    bundle: Map, measured: tuple[MeasuredFrame, ...], T_map_level: Float64[NDArray[np.float64], "n 4 4"]
 ) -> tuple[Float64[NDArray[np.float64], " n"], Float64[NDArray[np.float64], " n"]]:
     """Compute the similarity of all frames of a query to the map at given poses.
 
@@ -65,7 +65,7 @@ def similarity_of(
 
 
 def similarities_at(
-    bundle: MapBundle,
+    bundle: Map,
     descriptors: Float32[NDArray[np.float32], "T D"],
     *,
     R_map_level: Float64[NDArray[np.float64], "n 3 3"],

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from service.geometry.rigid import transform_from
-from service.maps.reader import MapBundle
+from service.maps.map import Map
 from service.registration.local_search import LocalPose
 from service.registration.register import Registered
 from service.registration.surfel_tiles import Cloud
@@ -84,7 +84,7 @@ Weighted = tuple[Scorer, float]
 
 
 def scorers_of(
-    bundle: MapBundle,
+    bundle: Map,
     cloud: Cloud,
     measured: tuple[MeasuredFrame, ...],
     prior: Prior | None,

@@ -8,6 +8,7 @@ import pytest
 from benchmarks.native import against_numpy
 from service.localization.localizer import Localizer
 from service.maps.reader import MapBundle
+from service.registration.surfel_map import SurfelMap
 from service.retrieval.query import Query
 
 
@@ -16,7 +17,7 @@ def test_numpy_says_what_the_compiled_code_says_and_both_are_timed(
 ) -> None:
     localizer, (rgb, depth_m, camera) = Localizer.open(MapBundle.open(bundle_path)), pictures
     query, cloud = Query(rgb=rgb, depth_m=depth_m, camera=camera), localizer.bundle.cloud
-    assert cloud is not None
+    assert isinstance(cloud, SurfelMap)
     found = against_numpy._of_imaging(query, localizer.bundle.grid, parts_of()["depth"])
     found |= against_numpy._of_registration(localizer, cloud, query)
     assert {name.partition(":")[0] for name in found} >= {"level.py", "gather.py", "points.py", "kernel.py", "rays.py"}

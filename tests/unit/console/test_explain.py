@@ -17,6 +17,7 @@ from service.contract import schema
 from service.contract.convert import parsed, query_from
 from service.imaging.view_grid import MAX_RANGE_M, ViewGrid
 from service.localization.refine import RefineSettings
+from service.registration.surfel_map import SurfelMap
 from service.runtime.engine import Engine
 from service.runtime.settings import Settings
 
@@ -67,7 +68,7 @@ def test_views_have_the_grids_cells(explanation: Explanation, engine: Engine) ->
 
 def test_points_lie_where_the_map_has_surfaces(explanation: Explanation, engine: Engine) -> None:
     cloud = engine.registry.get(None).bundle.cloud
-    assert cloud is not None
+    assert isinstance(cloud, SurfelMap)
     records = np.frombuffer(explanation.points, np.dtype([("xyz", "<f4", (3,)), ("rgb", "u1", (4,))]))
     points = records["xyz"][::37] + explanation.origin_m
     surfels = cloud.surfels["xyz"] + cloud.origin_m

@@ -17,7 +17,7 @@ def test_a_valid_bundle_opens_and_its_parts_are_listed(bundle_path):
     assert localizer.bundle is bundle
     assert on_disk.check_streets(bundle).text == "3 streets or sections"
     assert bundle.cloud is not None
-    assert on_disk.check_cloud(bundle).text == f"{len(bundle.cloud.surfels)} surfels"
+    assert on_disk.check_cloud(bundle).text == f"{bundle.manifest.counts.cloud_points} surfels"
     uncalibrated = on_disk.check_calibration(bundle, 0.02)
     assert uncalibrated.level == "warning"
     assert "all of them are LOCALIZED" in uncalibrated.text

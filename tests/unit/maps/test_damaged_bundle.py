@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from service.errors import BundleError
-from service.maps import reader
+from service.maps import files, reader
 from service.maps.manifest import Manifest
 from service.maps.reader import MapBundle
 from service.maps.writer import sha256_of
@@ -71,8 +71,8 @@ def test_a_file_that_vanishes_while_the_bundle_is_opened_is_refused(
         original(*arguments, **changed)
         (bundle_copy / name).unlink()
 
-    original = reader._require_files
-    monkeypatch.setattr(reader, "_require_files", looked_at)
+    original = files.require_files
+    monkeypatch.setattr(reader, "require_files", looked_at)
     with pytest.raises(BundleError, match=name.rpartition("/")[2]):
         MapBundle.open(bundle_copy).encoder_bytes()
 

@@ -21,7 +21,7 @@ from service.grpc.messages import answer_message
 from service.localization import localizer as localizer_module
 from service.localization.answer import Answer, require_finite
 from service.localization.localizer import Localizer
-from service.maps.reader import MapBundle
+from service.maps.map import Map
 from service.maps.writer import write_bundle
 from service.retrieval.prior import Prior
 from service.retrieval.query import Query
@@ -107,7 +107,7 @@ odometry = st.one_of(
 )
 
 
-def require_consistent(answer: Answer, query: Any, bundle: MapBundle) -> None:
+def require_consistent(answer: Answer, query: Any, bundle: Map) -> None:
     """Check that an answer is finite and that its parts are consistent."""
     require_finite(answer)
     assert bundle.calibration is not None

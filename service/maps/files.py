@@ -1,0 +1,112 @@
+"""Read and check the files of a map bundle. Every error names the file and the remedy."""
+
+import json
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from service.errors import BundleError
+from service.imaging.npy_header import NPY_HEADER_ERRORS
+from service.maps import content as parts
+from service.maps.manifest import Manifest
+from service.maps.writer import sha256_of
+
+REMEDY = "copy or build the bundle again"
+
+
+def require_files(path: Path, manifest: Manifest, needed: Iterable[str], *, verify: bool) -> None:
+    """Check that the files of a bundle are there, and that they are those of the manifest.
+
+    Args:
+        path: the bundle's folder.
+        manifest: its manifest.
+        needed: files that the manifest must list.
+        verify: compare the hash of every file. Sizes are always compared.
+
+    Raises:
+        BundleError: a file is missing, damaged or outside the folder.
+    """
+    for name in needed:
+        if name not in manifest.files:
+            raise defect(path / name, "not listed in the manifest")
+    for name, entry in manifest.files.items():
+        file = path / name
+        if not file.is_file() or not file.resolve().is_relative_to(path.resolve()):
+            raise defect(file, "missing, or outside the bundle")
+        try:
+            size = file.stat().st_size
+            found = sha256_of(file) if verify and size == entry.size else entry.sha256
+        except OSError as error:  # for example, somebody removes the bundle meanwhile
+            raise defect(file, f"cannot be read ({error.strerror})") from error
+        if size != entry.size:
+            raise defect(file, f"{size} bytes instead of {entry.size}")
+        if found != entry.sha256:
+            raise defect(file, "the hash does not match the manifest")
+    if manifest.files[parts.ENCODER_FILE].sha256 != manifest.encoder_sha256:
+        raise defect(path / parts.ENCODER_FILE, "not the encoder that computed the descriptors")
+
+
+def read_file(path: Path) -> bytes:
+    """Return the content of a file.
+
+    Args:
+        path: the file.
+
+    Raises:
+        BundleError: the file cannot be read.
+    """
+    try:
+        return path.read_bytes()
+    except OSError as error:  # for example, somebody removes the bundle meanwhile
+        raise defect(path, f"cannot be read ({error.strerror})") from error
+
+
+def map_array(path: Path, *, expected: np.dtype[Any] | None) -> NDArray[Any]:
+    """Map an array into memory.
+
+    Args:
+        path: NPY file.
+        expected: type of its elements, in one dimension; None for any array.
+
+    Raises:
+        BundleError: the file is not an NPY array, or has another type or number of dimensions.
+    """
+    try:
+        array = np.load(path, allow_pickle=False, mmap_mode="r")
+    except (OSError, *NPY_HEADER_ERRORS) as error:
+        raise defect(path, f"not a valid NPY array ({error})") from error
+    if expected is not None and (array.dtype != expected or array.ndim != 1):
+        raise defect(path, f"{array.dtype} in {array.ndim} dimensions instead of {expected} in 1")
+    return array  # type: ignore[no-any-return]  # np.load is not typed for one array
+
+
+def json_object(content: bytes, path: Path) -> dict[str, Any]:
+    """Return a JSON object.
+
+    Args:
+        content: content of the file.
+        path: the file, for the error message.
+
+    Raises:
+        BundleError: the content is not a JSON object.
+    """
+    try:
+        document = json.loads(content)
+    except (ValueError, RecursionError) as error:
+        raise defect(path, "not valid JSON") from error
+    if not isinstance(document, dict):
+        raise defect(path, "not a JSON object")
+    return document
+
+
+def defect(path: Path, what: str) -> BundleError:
+    """Return the error for a defect of a file.
+
+    Args:
+        path: the file.
+        what: what is wrong.
+    """
+    return BundleError(f"{path}: {what}; {REMEDY}", field=path.name)

@@ -1,0 +1,194 @@
+"""Write a tiled map from finished tiles, atomically."""
+
+from collections.abc import Mapping, Sequence
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from service.errors import BundleError
+from service.maps import content as parts
+from service.maps import index, inverted_file, manifest, streets
+from service.maps.calibration import Calibration, Site, read_calibration
+from service.maps.files import map_array, read_file, require_files
+from service.maps.joined_index import JoinedRows
+from service.maps.manifest import TILES_FOLDER, Counts, FileEntry, Manifest, Tile, read_manifest
+from service.maps.tiles import MOST_SEARCHED, differences
+from service.maps.writer import in_place, json_bytes, link_or_copy, sha256_of, sync
+
+_NEEDED = (parts.ENCODER_FILE, index.FILE, parts.PLACES_FILE, parts.VIEWS_FILE, parts.CALIBRATION_FILE)
+_REMEDY = "build all tiles with the same encoder and settings"
+
+
+def write_tiled(
+    out: Path,
+    tiles: Mapping[tuple[int, int], Path],
+    tile_m: float,
+    *,
+    name: str,
+    overwrite: bool = False,
+) -> Manifest:
+    """Write a tiled map and return its manifest.
+
+    The files of the tiles become hard links, or copies where the file system has no links. The map appears under ``out`` complete or not
+    at all, as with ``write_bundle``.
+
+    Args:
+        out: folder of the map.
+        tiles: folder of each tile's bundle, by column and row of its square.
+        tile_m: edge of the squares, m.
+        name: name of the map in requests.
+        overwrite: replace an existing map.
+
+    Raises:
+        BundleError: ``out`` exists and ``overwrite`` is False, there is no tile, a tile is damaged or does not fit to the others, or the
+            file system reports an error.
+    """
+    if out.exists() and not overwrite:
+        raise BundleError(f"{out}: already exists; choose another --out or pass --overwrite", field="out")
+    if not tiles:
+        raise BundleError(f"{out}: the map would have no tile; give at least one", field="tiles")
+    squares, folders = sorted(tiles), [tiles[square] for square in sorted(tiles)]
+    manifests = [_opened(folder) for folder in folders]
+    for folder, each in zip(folders[1:], manifests[1:], strict=True):
+        if different := differences(each, manifests[0]):
+            raise BundleError(f"{folder}: {different[0]} is not that of {folders[0]}; {_REMEDY}", field="tiles")
+    remedy = "free disk space or choose another folder"
+    with in_place(out, f"{out}: the map cannot be written", remedy) as partial:
+        entries = [
+            _link_tile(partial, folder, each, square)
+            for square, folder, each in zip(squares, folders, manifests, strict=True)
+        ]
+        made = _write_shared(partial, entries, manifests, tile_m, name)
+        partial.chmod(0o755)
+    return made
+
+
+def _opened(folder: Path) -> Manifest:
+    read = read_manifest(folder)
+    if read.tiles:
+        raise BundleError(f"{folder}: a tiled map cannot be a tile; give its tiles", field="tiles")
+    require_files(folder, read, _NEEDED, verify=False)
+    return read
+
+
+def _link_tile(map_folder: Path, folder: Path, read: Manifest, square: tuple[int, int]) -> Tile:
+    """Link the files of a tile into the map; return its entry in the manifest."""
+    target = map_folder / TILES_FOLDER / read.version
+    if target.exists():
+        raise BundleError(
+            f"{folder}: another tile has the same content ({read.version}); give each square its own tile",
+            field="tiles",
+        )
+    for name in (*sorted(read.files), manifest.FILE):
+        (target / name).parent.mkdir(parents=True, exist_ok=True)
+        link_or_copy(folder / name, target / name)
+    for each in {(target / name).parent for name in read.files} | {target, target.parent}:
+        sync(each)
+    size = sum(entry.size for entry in read.files.values()) + (folder / manifest.FILE).stat().st_size
+    return Tile(
+        column=square[0],
+        row=square[1],
+        version=read.version,
+        manifest_sha256=sha256_of(target / manifest.FILE),
+        size=size,
+        counts=read.counts,
+    )
+
+
+def _write_shared(
+    folder: Path, tiles: Sequence[Tile], manifests: Sequence[Manifest], tile_m: float, name: str
+) -> Manifest:
+    """Write the shared files and the manifest; return the manifest."""
+    first, bundles = manifests[0], [folder / tile.folder for tile in tiles]
+    names = [parts.ENCODER_FILE, parts.PLACES_FILE, parts.CALIBRATION_FILE]
+    link_or_copy(bundles[0] / parts.ENCODER_FILE, folder / parts.ENCODER_FILE)
+    if streets.FILE in first.files:
+        names.append(streets.FILE)
+        link_or_copy(bundles[0] / streets.FILE, folder / streets.FILE)
+    places = [map_array(bundle / parts.PLACES_FILE, expected=parts.PLACE) for bundle in bundles]
+    np.save(folder / parts.PLACES_FILE, np.concatenate(places), allow_pickle=False)
+    (folder / parts.CALIBRATION_FILE).write_bytes(json_bytes(_calibration(bundles)))
+    parameters = {key: value for key, value in first.parameters.items() if key in _common(manifests)}
+    if len(tiles) > MOST_SEARCHED:
+        names.append(inverted_file.FILE)
+        arrays = [index.read_descriptors(bundle / index.FILE) for bundle in bundles]
+        rows = JoinedRows([len(each) for each in arrays], arrays[0].shape[1], arrays.__getitem__)
+        parameters[inverted_file.RECALL] = inverted_file.write_inverted_file(
+            folder / inverted_file.FILE, rows, headings=first.headings
+        )
+    for each in names:
+        sync(folder / each)
+    files = {
+        each: FileEntry(sha256=sha256_of(folder / each), size=(folder / each).stat().st_size) for each in sorted(names)
+    }
+    made = first.model_copy(
+        update={
+            "name": name,
+            "made_at": datetime.now(UTC),
+            "parameters": parameters,
+            "counts": Counts(
+                places=sum(tile.counts.places for tile in tiles),
+                views=sum(tile.counts.views for tile in tiles),
+                descriptor_size=first.counts.descriptor_size,
+                cloud_points=sum(tile.counts.cloud_points for tile in tiles),
+                streets=first.counts.streets,
+            ),
+            "files": files,
+            "tile_m": tile_m,
+            "tiles": tuple(tiles),
+        }
+    )
+    made = Manifest.model_validate(made.model_dump()).stamped()
+    (folder / manifest.FILE).write_bytes(made.to_bytes())
+    sync(folder / manifest.FILE)
+    return made
+
+
+def _common(manifests: Sequence[Manifest]) -> set[str]:
+    """Return the names of the parameters that are the same in all tiles."""
+    first = manifests[0].parameters
+    return {key for key, value in first.items() if all(each.parameters.get(key) == value for each in manifests)}
+
+
+def _calibration(bundles: Sequence[Path]) -> dict[str, Any]:
+    """Return the calibration of the map: that of the tiles, with the checks of all their sites together."""
+    read = [_read(bundle) for bundle in bundles]
+    first = read[0]
+    plain = [None if each is None else each.model_copy(update={"site": None}) for each in read]
+    for bundle, each in zip(bundles, plain, strict=True):
+        if each != plain[0]:
+            raise BundleError(
+                f"{bundle}: {parts.CALIBRATION_FILE} is not that of the other tiles; {_REMEDY}", field="tiles"
+            )
+    if first is None:
+        return dict(parts.UNCALIBRATED)
+    sites = [each.site for each in read if each is not None and each.site is not None]
+    return first.model_copy(update={"site": joined_site(sites)}).model_dump(mode="json")
+
+
+def _read(bundle: Path) -> Calibration | None:
+    path = bundle / parts.CALIBRATION_FILE
+    return read_calibration(read_file(path), path=str(path))
+
+
+def joined_site(sites: Sequence[Site]) -> Site | None:
+    """Return the check of a map from the checks of its tiles; None if there is none.
+
+    The offset and the calibration error are means over the queries of all tiles.
+
+    Args:
+        sites: check of each tile that has one.
+    """
+    queries: NDArray[np.float64] = np.array([site.queries for site in sites], np.float64)
+    if not queries.sum():
+        return None
+    weights = queries / queries.sum()
+    return Site(
+        offset=float(weights @ [site.offset for site in sites]),
+        queries=int(queries.sum()),
+        right=sum(site.right for site in sites),
+        expected_calibration_error=float(weights @ [site.expected_calibration_error for site in sites]),
+    )

@@ -1,0 +1,441 @@
+"""A tiled map: a bundle for each square of the ground. A query opens the few tiles that it needs.
+
+The search index of the whole map says which tiles resemble a query. A prior, or the poses that are registered, name tiles too. Their parts
+together behave like a map of one bundle.
+"""
+
+import threading
+from collections import OrderedDict, defaultdict
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Protocol, runtime_checkable
+
+import numpy as np
+from jaxtyping import Float32, Float64, Int32, Int64
+from numpy.typing import NDArray
+
+from service.errors import BundleError
+from service.maps import content as parts
+from service.maps import inverted_file, manifest, streets
+from service.maps.calibration import read_calibration
+from service.maps.files import defect, json_object, map_array, read_file, require_files
+from service.maps.index import ViewIndex
+from service.maps.inverted_file import InvertedFile
+from service.maps.joined_index import JoinedRows, JoinedShortlists
+from service.maps.manifest import Manifest, Tile, read_manifest
+from service.maps.map import Map
+from service.maps.reader import MapBundle
+from service.maps.streets import Streets
+from service.maps.writer import sha256_of
+from service.registration.surfel_map import SurfelMap
+from service.registration.surfel_tiles import SurfelTiles, nearest_square
+
+#: Largest number of tiles that are searched for one query. A map of more tiles needs a search index, which chooses them.
+MOST_SEARCHED = 6
+#: Largest number of tiles that the poses of a query may lie in: those searched for several frames, and those of predicted poses.
+MOST_AROUND = 2 * MOST_SEARCHED
+#: Views that the search index lists to choose the tiles.
+LISTED = 1_000
+#: Limit of the size of all open tiles, bytes. The system keeps only the parts in memory that queries read.
+OPEN_BYTES = 4 * 2**30
+#: Largest number of regions that are kept, each put together from several tiles.
+MOST_REGIONS = 16
+_NEEDED = (parts.ENCODER_FILE, parts.PLACES_FILE, parts.CALIBRATION_FILE)
+
+
+@runtime_checkable
+class TileSource(Protocol):
+    """Where the tiles of a map come from."""
+
+    def folder(self, tile: Tile) -> Path:
+        """Return a local folder with the complete bundle of a tile. Several threads may ask at once.
+
+        Args:
+            tile: as the manifest of the map lists it.
+
+        Raises:
+            BundleError: the tile is missing or damaged, or cannot be fetched.
+        """
+
+
+@dataclass(frozen=True, slots=True)
+class LocalTiles:
+    """Tiles in the folder of the map.
+
+    Attributes:
+        path: folder of the map.
+    """
+
+    path: Path
+
+    def folder(self, tile: Tile) -> Path:
+        """Return the folder of a tile.
+
+        Args:
+            tile: as the manifest of the map lists it.
+        """
+        return self.path / tile.folder
+
+
+def open_map(path: Path, *, verify: bool = True) -> Map:
+    """Open a map of one bundle or a tiled map.
+
+    Args:
+        path: folder of the map.
+        verify: compare the hash of every file with the manifest. Those of a tile are compared when the tile is opened.
+
+    Raises:
+        BundleError: the map is missing, damaged, of another format, or inconsistent.
+    """
+    return TiledMap.open(path, verify=verify) if read_manifest(path).tiles else MapBundle.open(path, verify=verify)
+
+
+class OpenTiles:
+    """The tiles of a map that are open. The least recently used ones are closed. Several threads may share them.
+
+    Args:
+        path: folder of the map.
+        of_map: manifest of the map.
+        source: where the tiles come from.
+        verify: compare the hash of every file of a tile when it is opened.
+        open_bytes: limit of the size of all open tiles, bytes. At least one tile is open.
+
+    Attributes:
+        squares_m: x0, y0, x1, y1 of each tile, map frame, m.
+        first_place: number of the first place of each tile, and the number of all places.
+    """
+
+    def __init__(self, path: Path, of_map: Manifest, source: TileSource, *, verify: bool, open_bytes: int) -> None:
+        self._path, self._manifest, self._source = path, of_map, source
+        self._verify, self._limit = verify, open_bytes
+        self._opened: OrderedDict[int, MapBundle] = OrderedDict()
+        self._regions: dict[tuple[int, ...], Map] = {}
+        self._changing = threading.Lock()
+        self._opening: defaultdict[int, threading.Lock] = defaultdict(threading.Lock)
+        corners = np.array(
+            [[tile.column, tile.row, tile.column + 1, tile.row + 1] for tile in of_map.tiles], np.float64
+        )
+        self.squares_m = corners * (of_map.tile_m or 0.0)
+        self.first_place = np.cumsum([0, *(tile.counts.places for tile in of_map.tiles)])
+
+    def __len__(self) -> int:
+        """Return the number of tiles of the map, open or not."""
+        return len(self._manifest.tiles)
+
+    @property
+    def opened(self) -> tuple[int, ...]:
+        """Numbers of the open tiles, the least recently used first."""
+        with self._changing:
+            return tuple(self._opened)
+
+    def get(self, number: int) -> MapBundle:
+        """Return a tile; open it if needed.
+
+        Args:
+            number: number of the tile in the manifest.
+
+        Raises:
+            BundleError: the tile is missing or damaged, or does not belong to this map.
+        """
+        if (known := self._known(number)) is not None:
+            return known
+        with self._changing:
+            opening = self._opening[number]
+        with opening:  # other threads that need this tile wait; those that need others do not
+            if (known := self._known(number)) is not None:
+                return known
+            made = self._open(self._manifest.tiles[number])
+            with self._changing:
+                self._opened[number] = made
+                self._close_some()
+            return made
+
+    def region(self, numbers: tuple[int, ...], make: Callable[[tuple[int, ...]], Map]) -> Map:
+        """Return the parts of some tiles together. They are kept as long as all of these tiles are open.
+
+        Args:
+            numbers: numbers of the tiles, ascending.
+            make: puts the parts together.
+        """
+        with self._changing:
+            known = self._regions.get(numbers)
+            if known is not None:
+                for number in numbers:
+                    self._opened.move_to_end(number)
+                return known
+        made = make(numbers)
+        with self._changing:
+            if all(number in self._opened for number in numbers):
+                self._regions[numbers] = made
+                while len(self._regions) > MOST_REGIONS:
+                    del self._regions[next(iter(self._regions))]
+        return made
+
+    def cloud(self, numbers: Sequence[int], opened: Sequence[MapBundle] | None = None) -> SurfelTiles | None:
+        """Return the clouds of some tiles; None if the map has no cloud.
+
+        Args:
+            numbers: numbers of the tiles.
+            opened: these tiles; None opens each one when it is needed.
+        """
+        if not self._manifest.counts.cloud_points:
+            return None
+        squares_m = self.squares_m[list(numbers)]
+        middle_m = np.array([*(squares_m[:, :2] + squares_m[:, 2:]).mean(axis=0) / 2, 0.0])
+
+        def cloud_of(row: int) -> SurfelMap:
+            cloud = (self.get(numbers[row]) if opened is None else opened[row]).cloud
+            if not isinstance(cloud, SurfelMap):
+                raise defect(self._path / self._manifest.tiles[numbers[row]].folder, "the tile has no cloud")
+            return cloud
+
+        has_brightness = opened is not None and all(
+            each.cloud is not None and each.cloud.has_brightness for each in opened
+        )
+        return SurfelTiles(squares_m, cloud_of, middle_m, has_brightness)
+
+    def _known(self, number: int) -> MapBundle | None:
+        with self._changing:
+            if number in self._opened:
+                self._opened.move_to_end(number)
+            return self._opened.get(number)
+
+    def _close_some(self) -> None:
+        tiles = self._manifest.tiles
+        while len(self._opened) > 1 and sum(tiles[number].size for number in self._opened) > self._limit:
+            closed, _ = self._opened.popitem(last=False)
+            self._regions = {key: region for key, region in self._regions.items() if closed not in key}
+
+    def _open(self, tile: Tile) -> MapBundle:
+        folder = self._source.folder(tile)
+        try:
+            found = sha256_of(folder / manifest.FILE)
+        except OSError as error:
+            raise defect(folder / manifest.FILE, f"cannot be read ({error.strerror})") from error
+        if found != tile.manifest_sha256:
+            raise defect(folder / manifest.FILE, "not the tile that the map lists; the hash does not match")
+        bundle = MapBundle.open(folder, verify=self._verify)
+        if different := differences(bundle.manifest, self._manifest):
+            raise defect(folder / manifest.FILE, f"{different[0]} is not that of the map")
+        if bundle.manifest.counts != tile.counts:
+            raise defect(folder / manifest.FILE, "the counts are not those that the map lists")
+        return bundle
+
+
+def differences(tile: Manifest, of_map: Manifest) -> list[str]:
+    """Return what a tile does not share with its map, or with another tile; empty if it fits.
+
+    Args:
+        tile: manifest of the tile.
+        of_map: manifest of the map, or of another tile.
+    """
+    shared = (
+        "encoder_sha256",
+        "grid",
+        "headings",
+        "spacing_m",
+        "rows_seen",
+        "georeference",
+        "lidar_height_m",
+        "survey_std",
+    )
+    found = [name for name in shared if getattr(tile, name) != getattr(of_map, name)]
+    if tile.counts.descriptor_size != of_map.counts.descriptor_size:
+        found.append("counts.descriptor_size")
+    if tile.files.get(streets.FILE) != of_map.files.get(streets.FILE):
+        found.append(streets.FILE)
+    return found
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Region(Map):
+    """Some tiles of a map together. It behaves like a map of one bundle.
+
+    Attributes:
+        place_number: number of each place in the whole map.
+    """
+
+    place_number: Int32[NDArray[np.int32], " P"]
+
+    def numbers_of(self, places: Int32[NDArray[np.int32], " n"]) -> Int32[NDArray[np.int32], " n"]:
+        """Return the numbers of some places in the whole map.
+
+        Args:
+            places: indices of places in ``places``.
+        """
+        return self.place_number[places]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TiledMap(Map):
+    """An open tiled map. Its tiles open when they are needed. Several threads may share it.
+
+    ``places`` has the places of all tiles, and ``view_index`` the descriptors. ``views`` is empty, because the views lie in the tiles.
+    ``searched`` and ``around`` return parts of the map that are complete.
+
+    Attributes:
+        tiles: opens the tiles.
+        inverted: search index of the whole map; None if the map has few tiles.
+    """
+
+    tiles: OpenTiles
+    inverted: InvertedFile | None
+
+    @classmethod
+    def open(
+        cls, path: Path, *, verify: bool = True, source: TileSource | None = None, open_bytes: int = OPEN_BYTES
+    ) -> "TiledMap":
+        """Open a tiled map. This opens none of its tiles.
+
+        Args:
+            path: folder with the manifest and the shared files.
+            verify: compare the hash of every file with the manifest. Those of a tile are compared when the tile is opened.
+            source: where the tiles come from; None takes them from ``path``.
+            open_bytes: limit of the size of all open tiles, bytes. At least one tile is open.
+
+        Raises:
+            BundleError: the map is missing, damaged, of another format, or inconsistent.
+        """
+        read = read_manifest(path)
+        if not read.tiles:
+            raise BundleError(
+                f"{path}: a map of one bundle, not a tiled map; open it with open_map", field=manifest.FILE
+            )
+        require_files(path, read, _NEEDED, verify=verify)
+        document = read_file(path / streets.FILE) if streets.FILE in read.files else None
+        tiles = OpenTiles(path, read, source or LocalTiles(path), verify=verify, open_bytes=open_bytes)
+        inverted = _inverted(path, read, verify=verify)
+        every, sizes = range(len(tiles)), [tile.counts.views for tile in read.tiles]
+        rows = JoinedRows(sizes, read.counts.descriptor_size, lambda k: tiles.get(k).view_index.rows)
+        opened = cls(
+            path=path,
+            manifest=read,
+            grid=read.view_grid,
+            rows_seen=np.array(read.rows_seen, np.bool_),
+            places=map_array(path / parts.PLACES_FILE, expected=parts.PLACE),
+            views=np.empty(0, parts.VIEW),
+            view_index=ViewIndex(rows, inverted or JoinedShortlists(sizes, lambda k: tiles.get(k).view_index)),
+            streets=None if document is None else Streets.from_geojson(json_object(document, path / streets.FILE)),
+            streets_document=document,
+            calibration=read_calibration(
+                read_file(path / parts.CALIBRATION_FILE), path=str(path / parts.CALIBRATION_FILE)
+            ),
+            cloud=tiles.cloud(every),
+            tiles=tiles,
+            inverted=inverted,
+        )
+        _require_consistent(opened)
+        return opened
+
+    def searched(
+        self,
+        descriptor: Float32[NDArray[np.float32], " D"],
+        near: tuple[Float64[NDArray[np.float64], "2"], float] | None = None,
+    ) -> Map:
+        """Return the tiles to search for a query, as a map: those near the camera, or those with the most similar views.
+
+        Args:
+            descriptor: descriptor of the query.
+            near: x and y (m, map frame) and radius (m) of the area where the camera is; None if unknown. If no tile is there, all count.
+        """
+        chosen = np.arange(len(self.tiles))
+        if near is not None and (inside := _away_m(self.tiles.squares_m, near[0]) <= near[1]).any():
+            chosen = np.flatnonzero(inside)
+        if len(chosen) > MOST_SEARCHED and self.inverted is not None:
+            views = self.inverted.most_similar(descriptor, min(LISTED, self.manifest.counts.views))
+            similar = in_order(
+                np.searchsorted(self.tiles.first_place, views // self.manifest.headings, side="right") - 1
+            )
+            chosen = in_order(np.concatenate([similar[np.isin(similar, chosen)], chosen]))[:MOST_SEARCHED]
+        return self._region(chosen)
+
+    def around(self, positions_m: Float64[NDArray[np.float64], "n 3"]) -> Map:
+        """Return the tiles around some positions, as a map.
+
+        Args:
+            positions_m: positions, map frame, m, the most important first. They lie in few tiles. A position in a tile beyond
+                ``MOST_AROUND`` counts as one at the edge of the nearest of the others.
+        """
+        return self._region(in_order(nearest_square(self.tiles.squares_m, positions_m[:, :2]))[:MOST_AROUND])
+
+    def _region(self, numbers: Int64[NDArray[np.int64], " n"]) -> Map:
+        return self.tiles.region(tuple(sorted(numbers.tolist())), self._made)
+
+    def _made(self, numbers: tuple[int, ...]) -> Region:
+        """Put the parts of some tiles together."""
+        opened = [self.tiles.get(number) for number in numbers]
+        places, views, view_index = opened[0].places, opened[0].views, opened[0].view_index
+        if len(opened) > 1:
+            before = np.cumsum([0, *(len(each.places) for each in opened)])
+            places = np.concatenate([each.places for each in opened])
+            views = np.concatenate([each.views for each in opened])
+            views["place"] += np.repeat(before[:-1], [len(each.views) for each in opened]).astype(np.int32)
+            indices = [each.view_index for each in opened]
+            sizes = [len(each) for each in indices]
+            rows = JoinedRows(sizes, view_index.dimension, lambda k: indices[k].rows)
+            view_index = ViewIndex(rows, JoinedShortlists(sizes, indices.__getitem__))
+        first = self.tiles.first_place
+        number = np.concatenate([np.arange(first[tile], first[tile + 1], dtype=np.int32) for tile in numbers])
+        return Region(
+            path=self.path,
+            manifest=self.manifest,
+            grid=self.grid,
+            rows_seen=self.rows_seen,
+            places=places,
+            views=views,
+            view_index=view_index,
+            streets=self.streets,
+            streets_document=self.streets_document,
+            calibration=self.calibration,
+            cloud=self.tiles.cloud(numbers, opened),
+            place_number=number,
+        )
+
+
+def in_order(numbers: Int64[NDArray[np.int64], " n"]) -> Int64[NDArray[np.int64], " m"]:
+    """Return each number once, in the order of its first occurrence.
+
+    Args:
+        numbers: some numbers.
+    """
+    _, first = np.unique(numbers, return_index=True)
+    return numbers[np.sort(first)]
+
+
+def _away_m(
+    squares_m: Float64[NDArray[np.float64], "T 4"], xy_m: Float64[NDArray[np.float64], "2"]
+) -> Float64[NDArray[np.float64], " T"]:
+    """Return the distance of a point from each square, m; 0 inside."""
+    outside = np.maximum(np.maximum(squares_m[:, :2] - xy_m, xy_m - squares_m[:, 2:]), 0.0)
+    away: Float64[NDArray[np.float64], " T"] = np.linalg.norm(outside, axis=1)
+    return away
+
+
+def _inverted(path: Path, read: Manifest, *, verify: bool) -> InvertedFile | None:
+    if inverted_file.FILE in read.files:
+        return InvertedFile.open(
+            path / inverted_file.FILE,
+            views=read.counts.views,
+            dimension=read.counts.descriptor_size,
+            headings=read.headings,
+            verify=verify,
+        )
+    if len(read.tiles) > MOST_SEARCHED:
+        raise defect(path / inverted_file.FILE, f"missing, but a map of more than {MOST_SEARCHED} tiles needs it")
+    return None
+
+
+def _require_consistent(opened: TiledMap) -> None:
+    counts, path = opened.manifest.counts, opened.path
+    named = 0 if opened.streets is None else len(opened.streets)
+    if len(opened.places) != counts.places:
+        raise defect(path / parts.PLACES_FILE, f"{len(opened.places)} places instead of {counts.places}")
+    if named != counts.streets:
+        raise defect(path / streets.FILE, f"{named} streets instead of {counts.streets}")
+    if not parts.are_poses(opened.T_map_place):
+        raise defect(path / parts.PLACES_FILE, parts.NO_POSE)
+    if opened.place_street.min() < -1 or opened.place_street.max() >= named:
+        raise defect(path / parts.PLACES_FILE, "a place refers to a missing street")
+    if counts.views != counts.places * opened.manifest.headings:
+        raise defect(path / manifest.FILE, "the number of views is not that of all headings of all places")

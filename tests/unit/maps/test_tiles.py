@@ -1,0 +1,297 @@
+"""A tiled map answers as the same map in one bundle, and opens only the tiles that a query needs."""
+
+import json
+import shutil
+import threading
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from model_training.mapping.join import of_places
+from model_training.mapping.stored_map import content_of
+from service.errors import BundleError
+from service.localization.localizer import Localizer
+from service.maps import tiles as tiles_module
+from service.maps.calibration import Site
+from service.maps.manifest import read_manifest
+from service.maps.reader import MapBundle
+from service.maps.tiled_writer import joined_site, write_tiled
+from service.maps.tiles import LocalTiles, TiledMap, in_order, open_map
+from service.maps.writer import write_bundle
+from service.registration.surfel_tiles import nearest_square
+from service.retrieval.prior import Prior
+
+TILE_M = 50.0
+
+
+def split(whole: Path, folder: Path, tile_m: float = TILE_M) -> dict[tuple[int, int], Path]:
+    """Return a bundle for each square; each has the whole cloud."""
+    opened = MapBundle.open(whole)
+    content = replace(content_of(opened), cloud=opened.cloud)
+    cells = np.floor(content.T_map_place[:, :2, 3] / tile_m).astype(int)
+    made = {}
+    for column, row in np.unique(cells, axis=0).tolist():
+        out = made[column, row] = folder / f"{column}_{row}"
+        write_bundle(out, of_places(content, (cells == (column, row)).all(axis=1)))
+    return made
+
+
+@pytest.fixture(scope="module")
+def squares(stock_map: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[tuple[int, int], Path]:
+    return split(stock_map, tmp_path_factory.mktemp("squares"))
+
+
+@pytest.fixture(scope="module")
+def tiled_path(squares: dict[tuple[int, int], Path], tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out: Path = tmp_path_factory.mktemp("tiled") / "stock"
+    write_tiled(out, squares, TILE_M, name="stock")
+    return out
+
+
+@pytest.fixture
+def tiled(tiled_path: Path) -> TiledMap:
+    return TiledMap.open(tiled_path)
+
+
+@pytest.fixture
+def tiled_copy(tiled_path: Path, tmp_path: Path) -> Path:
+    shutil.copytree(tiled_path, tmp_path / "copy")
+    return tmp_path / "copy"
+
+
+def queries_of(dataset: Any, bundle: Any) -> list[Any]:
+    return [frame.query(bundle.grid) for frame in dataset.queries("drive1_precise")]
+
+
+def test_no_tile_is_open_before_a_query(tiled: TiledMap, stock_map: Path) -> None:
+    whole = MapBundle.open(stock_map)
+    assert len(tiled.tiles) > 1
+    assert tiled.tiles.opened == ()
+    assert tiled.manifest.counts.places == len(tiled.places) == len(whole.places)
+    assert isinstance(open_map(stock_map), MapBundle)
+
+
+def test_a_tiled_map_answers_as_the_same_map_in_one_bundle(
+    tiled: TiledMap, stock_map: Path, small_dataset: Any
+) -> None:
+    one, other = Localizer.open(MapBundle.open(stock_map)), Localizer.open(tiled)
+    for query in queries_of(small_dataset, tiled):
+        expected, found = one.localize(query), other.localize(query)
+        assert found.status == expected.status
+        assert found.confidence == pytest.approx(expected.confidence, abs=1e-4)
+        assert found.T_map_camera_guess == pytest.approx(expected.T_map_camera_guess, abs=1e-4)
+        assert found.covariance == pytest.approx(expected.covariance, rel=1e-2, abs=1e-6)
+        assert [each.position_m.tolist() for each in found.neighbours] == [
+            each.position_m.tolist() for each in expected.neighbours
+        ]
+
+
+def test_frames_of_several_tiles_are_answered_together(tiled: TiledMap, stock_map: Path, small_dataset: Any) -> None:
+    frames = list(small_dataset.queries("drive1_precise"))[:3]
+    poses = [frame.T_map_camera for frame in frames]
+    relative = tuple(np.linalg.inv(poses[0]) @ T for T in poses)
+    asked = tuple(frame.query(tiled.grid) for frame in frames)
+    expected = Localizer.open(MapBundle.open(stock_map)).localize_frames(asked, relative)
+    found = Localizer.open(tiled).localize_frames(asked, relative)
+    assert found.T_map_camera_guess == pytest.approx(expected.T_map_camera_guess, abs=1e-4)
+
+
+def test_places_of_an_answer_are_numbers_of_the_whole_map(tiled: TiledMap, small_dataset: Any) -> None:
+    answer = Localizer.open(tiled).localize(queries_of(small_dataset, tiled)[0])
+    for each in answer.neighbours:
+        assert tiled.T_map_place[each.place, :3, 3].tolist() == each.position_m.tolist()
+        assert tiled.place_street[each.place] == each.street
+
+
+def test_a_prior_opens_only_its_own_tile(tiled: TiledMap, small_dataset: Any) -> None:
+    frame = next(iter(small_dataset.queries("drive1_precise")))
+    corner = tiled.tiles.squares_m[0, :2]
+    query = replace(frame.query(tiled.grid), prior=Prior(position_m=corner - 40.0, position_std_m=1.0))
+    Localizer.open(tiled).localize(query)
+    far = (
+        np.hypot(40.0, 40.0) > 4.0 + 50.0
+    )  # sqrt(2) * 40 m are more than the radius, so no tile is near and all are searched
+    assert far
+    assert len(tiled.tiles.opened) == len(tiled.tiles)
+    again = TiledMap.open(tiled.path)
+    query = replace(query, prior=Prior(position_m=corner - 30.0, position_std_m=1.0))
+    Localizer.open(again).localize(query)
+    assert again.tiles.opened == (0,)
+
+
+def test_tiles_are_closed_beyond_the_limit(tiled_path: Path, small_dataset: Any) -> None:
+    small, large = TiledMap.open(tiled_path, open_bytes=1), TiledMap.open(tiled_path)
+    for query in queries_of(small_dataset, large):
+        found, expected = (Localizer.open(each).localize(query) for each in (small, large))
+        assert found.T_map_camera_guess == pytest.approx(expected.T_map_camera_guess, abs=1e-9)
+        assert len(small.tiles.opened) == 1
+    assert len(large.tiles.opened) == len(large.tiles)
+
+
+def test_regions_are_kept_while_their_tiles_are_open(tiled: TiledMap) -> None:
+    positions = tiled.tiles.squares_m[:2].reshape(2, 2, 2).mean(axis=1)
+    both = np.column_stack([positions, np.zeros(2)])
+    region = tiled.around(both)
+    assert tiled.around(both[::-1]) is region
+    assert len(region.places) == sum(tile.counts.places for tile in tiled.manifest.tiles[:2])
+    assert region.views["place"].tolist() == sorted(region.views["place"].tolist())
+
+
+def test_threads_open_a_tile_once(tiled: TiledMap, monkeypatch: pytest.MonkeyPatch) -> None:
+    opened, opening = [], MapBundle.open
+    monkeypatch.setattr(
+        MapBundle, "open", lambda folder, *, verify: opened.append(folder) or opening(folder, verify=verify)
+    )
+    threads = [threading.Thread(target=tiled.tiles.get, args=(0,)) for _ in range(8)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert len(opened) == 1
+
+
+def test_the_search_index_chooses_the_tiles_of_a_large_map(
+    content_of: Callable[..., Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Nine tiles in a row, each with places that resemble no other tile."""
+    rng = np.random.default_rng(0)
+    made, vectors = {}, []
+    for column in range(9):
+        content = content_of(name="row", cloud=None)
+        content.T_map_place[:, 0, 3] = column * TILE_M + 10.0
+        content.T_map_place[:, 1, 3] = 10.0
+        random = rng.normal(size=content.descriptors.shape)
+        content.descriptors[:] = random / np.linalg.norm(random, axis=1, keepdims=True)
+        vectors.append(content.descriptors[0].copy())
+        write_bundle(tmp_path / str(column), content)
+        made[column, 0] = tmp_path / str(column)
+    manifest = write_tiled(tmp_path / "row", made, TILE_M, name="row")
+    assert "search.faiss" in manifest.files
+    opened = TiledMap.open(tmp_path / "row")
+    for column in (0, 4, 8):
+        part = opened.searched(vectors[column])
+        assert set(part.numbers_of(np.arange(len(part.places), dtype=np.int32)) // 12) >= {column}
+        assert len(part.places) == 12 * tiles_module.MOST_SEARCHED
+    beside = opened.searched(vectors[8], (np.array([60.0, 10.0]), 20.0))
+    assert beside.T_map_place[:, 0, 3].tolist() == [10.0] * 12 + [60.0] * 12
+
+
+@pytest.mark.parametrize("name", ["descriptors.npy", "cloud/surfels.npy", "manifest.json"])
+def test_a_damaged_tile_is_refused_when_it_opens(tiled_copy: Path, name: str) -> None:
+    opened = TiledMap.open(tiled_copy)
+    tile = tiled_copy / opened.manifest.tiles[0].folder / name
+    content = tile.read_bytes()
+    tile.unlink()  # it is a hard link
+    tile.write_bytes(content[:-1] + bytes([content[-1] ^ 1]))
+    with pytest.raises(BundleError, match=f"{tile}: .*hash does not match"):
+        opened.tiles.get(0)
+    opened.tiles.get(1)
+
+
+def test_a_missing_tile_is_refused_when_it_opens(tiled_copy: Path) -> None:
+    opened = TiledMap.open(tiled_copy)
+    shutil.rmtree(tiled_copy / opened.manifest.tiles[1].folder)
+    with pytest.raises(BundleError, match=r"manifest.json: cannot be read"):
+        opened.tiles.get(1)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda document: document["tiles"].reverse(), "the order is wrong"),
+        (lambda document: document["tiles"].append(document["tiles"][0]), "occurs twice"),
+        (lambda document: document["tiles"][0]["counts"].update(places=7), "the tiles have"),
+        (lambda document: document.pop("tile_m"), "tile_m and tiles"),
+        (lambda document: document.update(tile_m=1.0), "tile_m"),
+        (lambda document: document["tiles"][0].update(column=2_000_000), "column"),
+        (lambda document: document["tiles"][0].update(version="../../etc"), "version"),
+    ],
+)
+def test_a_manifest_with_wrong_tiles_is_refused(tiled_copy: Path, change: Any, message: str) -> None:
+    from service.maps.manifest import Manifest
+
+    path = tiled_copy / "manifest.json"
+    document = json.loads(path.read_text())
+    change(document)
+    try:
+        content = Manifest.model_validate(document).stamped().to_bytes()
+    except ValueError:
+        content = json.dumps(document).encode()
+    path.unlink()
+    path.write_bytes(content)
+    with pytest.raises(BundleError, match=message):
+        TiledMap.open(tiled_copy)
+
+
+def test_places_of_another_map_are_refused(tiled_copy: Path) -> None:
+    path = tiled_copy / "places.npy"
+    places = np.load(path)[:-1]
+    path.unlink()
+    np.save(path, places)
+    with pytest.raises(BundleError, match=r"places.npy: \d+ bytes instead of"):
+        TiledMap.open(tiled_copy)
+
+
+def test_commands_for_one_bundle_say_that_the_map_is_tiled(tiled_path: Path) -> None:
+    with pytest.raises(BundleError, match="a tiled map, and this command needs a map of one bundle"):
+        MapBundle.open(tiled_path)
+    with pytest.raises(BundleError, match="not a tiled map"):
+        TiledMap.open(tiled_path / read_manifest(tiled_path).tiles[0].folder)
+
+
+def test_the_same_tiles_give_the_same_version(
+    squares: dict[tuple[int, int], Path], tiled_path: Path, tmp_path: Path
+) -> None:
+    again = write_tiled(tmp_path / "again", dict(reversed(squares.items())), TILE_M, name="stock")
+    assert again.version == read_manifest(tiled_path).version
+    fewer = write_tiled(tmp_path / "fewer", dict(list(squares.items())[1:]), TILE_M, name="stock")
+    assert fewer.version != again.version
+
+
+def test_tiles_that_do_not_fit_together_are_refused(
+    squares: dict[tuple[int, int], Path], small_map: Path, tmp_path: Path
+) -> None:
+    with pytest.raises(BundleError, match=r"small: encoder_sha256 is not that of"):
+        write_tiled(tmp_path / "out", {**squares, (7, 7): small_map}, TILE_M, name="stock")
+    with pytest.raises(BundleError, match="no tile"):
+        write_tiled(tmp_path / "out", {}, TILE_M, name="stock")
+    first = next(iter(squares.values()))
+    with pytest.raises(BundleError, match="same content"):
+        write_tiled(tmp_path / "out", {**squares, (7, 7): first}, TILE_M, name="stock")
+    assert not (tmp_path / "out").exists()
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_an_existing_map_is_replaced_only_on_request(squares: dict[tuple[int, int], Path], tmp_path: Path) -> None:
+    out = tmp_path / "stock"
+    write_tiled(out, squares, TILE_M, name="stock")
+    with pytest.raises(BundleError, match="already exists"):
+        write_tiled(out, squares, TILE_M, name="stock")
+    write_tiled(out, squares, TILE_M, name="other", overwrite=True)
+    assert read_manifest(out).name == "other"
+
+
+def test_the_site_check_of_a_map_is_the_mean_over_the_queries_of_its_tiles() -> None:
+    one = Site(offset=-1.0, queries=30, right=20, expected_calibration_error=0.1)
+    other = Site(offset=0.0, queries=10, right=10, expected_calibration_error=0.3)
+    found = joined_site([one, other])
+    assert found is not None
+    assert (found.offset, found.queries, found.right) == (-0.75, 40, 30)
+    assert found.expected_calibration_error == pytest.approx(0.15)
+    assert joined_site([]) is None
+
+
+def test_the_nearest_square_of_a_position() -> None:
+    squares_m = np.array([[0.0, 0.0, 50.0, 50.0], [50.0, 0.0, 100.0, 50.0]])
+    xy = np.array([[10.0, 10.0], [60.0, 49.0], [-5.0, 200.0], [120.0, -7.0]])
+    assert nearest_square(squares_m, xy).tolist() == [0, 1, 0, 1]
+    assert in_order(np.array([3, 1, 3, 0, 1])).tolist() == [3, 1, 0]
+
+
+def test_local_tiles_lie_in_the_folder_of_the_map(tiled: TiledMap) -> None:
+    tile = tiled.manifest.tiles[0]
+    assert LocalTiles(tiled.path).folder(tile) == tiled.path / "tiles" / tile.version
