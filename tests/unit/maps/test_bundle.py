@@ -109,7 +109,7 @@ def test_a_full_disk_leaves_nothing_behind(
     def full(path: Path) -> None:
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
-    monkeypatch.setattr(writer, "_sync", full)
+    monkeypatch.setattr(writer, "sync", full)
     with pytest.raises(BundleError, match="No space left on device"):
         write_bundle(tmp_path / "m", content)
     assert list(tmp_path.iterdir()) == []

@@ -87,7 +87,7 @@ def test_a_file_that_vanishes_while_it_is_compared_is_refused(
         return original(path)
 
     original = sha256_of
-    monkeypatch.setattr(reader, "sha256_of", compare)
+    monkeypatch.setattr(files, "sha256_of", compare)
     with pytest.raises(BundleError, match=f"{name}: cannot be read"):
         MapBundle.open(bundle_copy)
 

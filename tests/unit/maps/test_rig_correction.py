@@ -155,7 +155,7 @@ def test_a_link_to_a_bundle_stays_a_link(calibrated, calibration_json, tmp_path)
     assert rig_in(calibrated) == rig()
 
 
-@pytest.mark.parametrize("failing", ["_sync", "sha256_of"])
+@pytest.mark.parametrize("failing", ["sync", "sha256_of"])
 def test_a_full_disk_leaves_the_old_bundle(calibrated, calibration_json, monkeypatch, failing):
     version = MapBundle.open(calibrated).manifest.version
 

@@ -48,7 +48,7 @@ def opened(path: Path) -> Any:
 patched: Any = map_watcher
 patched._POLL_S = patched._RETRY_S = workers.RESTART_S = 0.02
 patched.read_manifest = manifest_of
-patched.MapBundle = SimpleNamespace(open=opened)
+patched.open_map = opened
 patched.Localizer = SimpleNamespace(open=lambda bundle, **_: SimpleNamespace(bundle=bundle))
 
 

@@ -9,8 +9,9 @@ import pytest
 from service.errors import BundleError
 from service.localization.localizer import Localizer
 from service.maps.content import BundleContent
-from service.maps.reader import MapBundle
+from service.maps.tiles import open_map
 from service.maps.writer import write_bundle
+from service.runtime import map_watcher
 from service.runtime.map_registry import MapRegistry
 from service.runtime.map_watcher import MapWatcher, stamp_of
 
@@ -285,8 +286,7 @@ def test_only_the_newest_three_versions_are_opened(
     for seed in range(1, 5):
         watched.write(f"v{seed}", seed=seed)
     opened: list[str] = []
-    real = MapBundle.open
-    monkeypatch.setattr(MapBundle, "open", lambda path: opened.append(path.name) or real(path))
+    monkeypatch.setattr(map_watcher, "open_map", lambda path: opened.append(path.name) or open_map(path))
     registry = MapRegistry()
     watcher = MapWatcher(registry, [watched.folder], warm=watched.warm)
     with caplog.at_level("INFO"):
