@@ -14,7 +14,7 @@ from model_training.evaluation.saved_run import SavedRun
 from model_training.reporting.comparison_page import HEAD, LABELS, row_of, write_comparison_page
 from model_training.reporting.plan import Plan
 from service.errors import BundleError, DatasetError
-from service.maps.reader import MapBundle
+from service.maps.tiles import open_map
 
 
 def command(
@@ -96,7 +96,7 @@ def _plan(runs: tuple[SavedRun, ...], console: Console) -> Plan | None:
     """Open the map of one of the runs if it exists."""
     for run in runs:
         try:
-            return Plan.of(MapBundle.open(Path(run.settings.map.path), verify=False))
+            return Plan.of(open_map(Path(run.settings.map.path), verify=False))
         except BundleError as error:
             why = error.message
     console.print(f"the page has no map: {why}", highlight=False)

@@ -23,7 +23,8 @@ from model_training.evaluation.stages import stages_of
 from model_training.evaluation.why_refused import FEW, causes
 from service.errors import DatasetError
 from service.localization.localizer import Localizer
-from service.maps.reader import MapBundle
+from service.maps.map import Map
+from service.maps.tiles import open_map
 
 SHOWN = (
     ("queries", "queries", "{:d}"),
@@ -109,7 +110,7 @@ def command(
         # Only a report needs matplotlib, and its import takes longer than that of all others. It must not fail after the run.
         from model_training.reporting.run_page import write_run_page
     require_map_first(bundle, dataset, "evaluate")
-    opened, data = MapBundle.open(bundle), Dataset(dataset)
+    opened, data = open_map(bundle), Dataset(dataset)
     names = queries or data.query_sets(with_truth=True)
     if trajectory is not None and len(names) != 1:
         raise DatasetError(
@@ -153,7 +154,7 @@ def command(
 
 def _add_raw(
     figures: dict[str, Any],
-    bundle: MapBundle,
+    bundle: Map,
     places: dict[str, NDArray[np.int64]],
     predictions: dict[str, Predictions],
 ) -> None:
@@ -178,7 +179,7 @@ def _raw_figures(right: dict[str, NDArray[np.bool_]], queries: slice) -> dict[st
     return {"raw_recall_at_1_5m": recalls[best], "raw": {"best_setting": best, "recall_at_1_5m": recalls}}
 
 
-def _say_why(bundle: MapBundle, data: Dataset, predictions: dict[str, Predictions]) -> None:
+def _say_why(bundle: Map, data: Dataset, predictions: dict[str, Predictions]) -> None:
     """Print what to check if few answers were accepted or the focal length is suspicious, the likeliest cause first."""
     console = Console(soft_wrap=True, highlight=False)
     for name, answers in predictions.items():

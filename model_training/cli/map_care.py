@@ -13,11 +13,14 @@ from model_training.mapping.build import describe
 from model_training.mapping.diff import diff_of, difference_png
 from model_training.mapping.info import info_of
 from model_training.mapping.merge import merge_maps
+from model_training.mapping.tiled_care import diff_of_tiles, merge_tiled
 from model_training.mapping.update import update_map
 from model_training.mapping.verify import damage_of
 from service.errors import BundleError
 from service.maps.calibration import RigCorrection
+from service.maps.manifest import read_manifest
 from service.maps.reader import MapBundle
+from service.maps.tiles import open_map
 
 app = typer.Typer(
     no_args_is_help=True, rich_markup_mode=None, help="Maintain map bundles: info, verify, diff, merge, update."
@@ -80,6 +83,9 @@ def diff(
     Example:
       streetfix map diff maps/town maps/town-may --picture changes.png
     """
+    if read_manifest(before).tiles:
+        _diff_tiles(before, after, as_json=as_json, picture=picture)
+        return
     a, b = MapBundle.open(before), MapBundle.open(after)
     found = diff_of(a, b)
     if picture is not None:
@@ -115,8 +121,9 @@ def merge(
       streetfix map merge maps/north maps/south --out maps/town
     """
     rigs = [_rig_of(each) for each in (first, second)]
+    merging = merge_tiled if read_manifest(first).tiles else merge_maps
     with bars() as report:
-        made = merge_maps(first, second, out, name=name, overwrite=overwrite, report=report)
+        made = merging(first, second, out, name=name, overwrite=overwrite, report=report)
     Console().print(f"{describe(made)}: {out}")
     if rigs[0] != rigs[1]:
         Console(soft_wrap=True).print(
@@ -170,7 +177,7 @@ def update(
 
 
 def _rig_of(bundle: Path) -> RigCorrection | None:
-    calibration = MapBundle.open(bundle, verify=False).calibration
+    calibration = open_map(bundle, verify=False).calibration
     return None if calibration is None else calibration.rig
 
 
@@ -185,6 +192,7 @@ def _info_lines(found: dict[str, Any]) -> list[str]:
         f"map {found['name']}, version {found['version']}, made {found['made_at']}, {found['size_bytes'] / 1e6:.1f} MB",
         f"places:      {counts['places']}, {found['spacing_m']:g} m apart, x {low[0]:g} to {high[0]:g} m, y {low[1]:g} to {high[1]:g} m",
         f"views:       {counts['views']}, {found['headings']} per place, descriptors of {counts['descriptor_size']}",
+        *([] if not found["tiles"] else [f"tiles:       {len(found['tiles'])}, {found['tile_m']:g} m wide"]),
         f"cloud:       {counts['cloud_points']} points"
         + (", voxel sums stored" if found["keeps_sums"] else ", no voxel sums stored"),
         f"streets:     {len(found['streets'])}, {counts['streets']} classes, {found['places_in_no_street']} places in no street",
@@ -195,6 +203,26 @@ def _info_lines(found: dict[str, Any]) -> list[str]:
         "parameters:  " + ", ".join(f"{name} {value:g}" for name, value in sorted(found["parameters"].items())),
         f"licence:     {found['licence'] or '-'}",
     ]
+
+
+def _diff_tiles(before: Path, after: Path, *, as_json: bool, picture: Path | None) -> None:
+    """Print the changes from one tiled map to another."""
+    if picture is not None:
+        raise typer.BadParameter(
+            "a tiled map has no picture of its changes; give two tiles of the maps", param_hint="--picture"
+        )
+    with bars() as report:
+        found = diff_of_tiles(before, after, report=report)
+    if as_json:
+        typer.echo(json.dumps(found, indent=1))
+        return
+    typer.echo(f"version:     {found['versions'][0]} -> {found['versions'][1]}")
+    counts = {name: len(found[name]) for name in ("added", "removed", "changed")}
+    typer.echo(f"tiles:       {', '.join(f'{count} {name}' for name, count in counts.items())}, {found['kept']} kept")
+    for each in found["changed"]:
+        typer.echo(f"tile ({each['column']}, {each['row']}):")
+        for line in _diff_lines(each):
+            typer.echo(f"  {line}")
 
 
 def _diff_lines(found: dict[str, Any]) -> list[str]:

@@ -12,7 +12,7 @@ from model_training.evaluation.measures import measure
 from model_training.evaluation.predict import Predictions, joined, predict
 from service.errors import DatasetError
 from service.localization.localizer import Localizer
-from service.maps.reader import MapBundle
+from service.maps.map import Map
 
 #: Progress callback: stage, finished steps, all steps.
 Report = Callable[[str, int, int], None]
@@ -32,7 +32,7 @@ class Evaluation:
 
 
 def evaluate(
-    bundle: MapBundle,
+    bundle: Map,
     dataset: Dataset,
     names: list[str] | None = None,
     *,

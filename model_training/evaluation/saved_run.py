@@ -15,7 +15,7 @@ from model_training.evaluation.evaluate import Evaluation
 from model_training.evaluation.predict import Predictions
 from service.errors import DatasetError
 from service.imaging.npy_header import NPY_HEADER_ERRORS
-from service.maps.reader import MapBundle
+from service.maps.map import Map
 
 #: Name of the settings file and of the folder of answers in a run's folder.
 FILE, ANSWERS = "run.json", "answers"
@@ -147,7 +147,7 @@ def _answers(folder: Path, each: RunSet) -> Predictions:
     return found
 
 
-def save_run(folder: Path, bundle: MapBundle, dataset: Dataset, evaluation: Evaluation) -> SavedRun:
+def save_run(folder: Path, bundle: Map, dataset: Dataset, evaluation: Evaluation) -> SavedRun:
     """Save a run: the answers, then the settings, then the figures. So ``run.json`` exists only if its answers do.
 
     Args:

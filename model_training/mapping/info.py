@@ -7,8 +7,8 @@ import numpy as np
 
 from model_training.mapping.stored_map import streets_of_bundle
 from service.maps import content as parts
-from service.maps.manifest import FILE
-from service.maps.reader import MapBundle
+from service.maps.manifest import FILE, Manifest, read_manifest
+from service.maps.tiles import open_map
 from service.retrieval.encoder import Encoder
 
 
@@ -23,7 +23,7 @@ def info_of(path: Path) -> dict[str, Any]:
     Raises:
         BundleError: the folder is not a bundle, or the bundle does not open.
     """
-    bundle = MapBundle.open(path, verify=False)
+    bundle = open_map(path, verify=False)
     manifest = bundle.manifest
     xyz = bundle.T_map_place[:, :3, 3]
     streets = streets_of_bundle(bundle) or {"features": []}
@@ -35,7 +35,9 @@ def info_of(path: Path) -> dict[str, Any]:
         "version": manifest.version,
         "format": manifest.format,
         "made_at": manifest.made_at.isoformat(),
-        "size_bytes": sum(entry.size for entry in manifest.files.values()) + (path / FILE).stat().st_size,
+        "size_bytes": _size(path, manifest),
+        "tile_m": manifest.tile_m,
+        "tiles": [tile.model_dump(include={"column", "row", "version", "size"}) for tile in manifest.tiles],
         "counts": manifest.counts.model_dump(),
         "headings": manifest.headings,
         "spacing_m": manifest.spacing_m,
@@ -53,8 +55,19 @@ def info_of(path: Path) -> dict[str, Any]:
         "calibrated": calibration is not None,
         "site": None if site is None else site.model_dump(),
         "rig": None if rig is None else rig.model_dump(),
-        "keeps_sums": parts.STATISTICS_FILE in manifest.files,
+        "keeps_sums": all(parts.STATISTICS_FILE in each.files for each in _bundles(path, manifest)),
         "licence": manifest.licence,
         "tool_versions": manifest.tool_versions,
         "files": {name: entry.size for name, entry in sorted(manifest.files.items())},
     }
+
+
+def _bundles(path: Path, manifest: Manifest) -> list[Manifest]:
+    """Return the manifest of each bundle of a map: its own, or those of its tiles."""
+    return [read_manifest(path / tile.folder) for tile in manifest.tiles] or [manifest]
+
+
+def _size(path: Path, manifest: Manifest) -> int:
+    """Return the size of all files of a map, bytes."""
+    shared = sum(entry.size for entry in manifest.files.values()) + (path / FILE).stat().st_size
+    return shared + sum(tile.size for tile in manifest.tiles)

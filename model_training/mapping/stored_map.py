@@ -12,6 +12,7 @@ from service.maps import content as parts
 from service.maps import streets
 from service.maps.byte_planes import read_records
 from service.maps.content import BundleContent
+from service.maps.map import Map
 from service.maps.reader import MapBundle
 
 
@@ -43,7 +44,7 @@ def content_of(bundle: MapBundle) -> BundleContent:
     )
 
 
-def streets_of_bundle(bundle: MapBundle) -> dict[str, Any] | None:
+def streets_of_bundle(bundle: Map) -> dict[str, Any] | None:
     """Return the GeoJSON of the streets; None for a map without streets.
 
     Args:

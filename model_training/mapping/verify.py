@@ -10,8 +10,9 @@ from model_training.mapping.stored_map import read_statistics, streets_of_bundle
 from service.errors import BundleError
 from service.maps import content as parts
 from service.maps import index
-from service.maps.manifest import FileEntry, read_manifest
+from service.maps.manifest import FileEntry, Manifest, read_manifest
 from service.maps.reader import MapBundle
+from service.maps.tiles import TiledMap
 from service.maps.writer import sha256_of
 
 #: Progress callback: stage, finished steps, all steps.
@@ -40,6 +41,8 @@ def damage_of(path: Path, *, report: Report = lambda *_: None) -> list[str]:
         report("files", number, len(manifest.files))
     if found:
         return found  # the content of damaged files would only give follow-up errors
+    if manifest.tiles:
+        return _damage_of_tiles(path, manifest, report)
     try:
         bundle = MapBundle.open(path)
         if parts.STATISTICS_FILE in manifest.files:
@@ -47,6 +50,25 @@ def damage_of(path: Path, *, report: Report = lambda *_: None) -> list[str]:
     except BundleError as error:
         return [error.message]
     return list(_contradictions(bundle))
+
+
+def _damage_of_tiles(path: Path, manifest: Manifest, report: Report) -> list[str]:
+    """Return the defects of the tiles of a map, and what does not fit to the map."""
+    try:
+        opened = TiledMap.open(path, verify=False, open_bytes=0)
+    except BundleError as error:
+        return [error.message]
+    found = []
+    for number, tile in enumerate(manifest.tiles):
+        damaged = damage_of(path / tile.folder)
+        if not damaged:
+            try:
+                opened.tiles.get(number)
+            except BundleError as error:
+                damaged = [error.message]
+        found += damaged
+        report("tiles", number + 1, len(manifest.tiles))
+    return found
 
 
 def _damage_of_file(folder: Path, name: str, entry: FileEntry) -> str:

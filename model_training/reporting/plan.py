@@ -9,12 +9,14 @@ from numpy.typing import NDArray
 from model_training.evaluation.failures import position_errors
 from model_training.evaluation.predict import Predictions
 from model_training.reporting.pictures import grey_webp_uri
-from service.maps.reader import MapBundle
+from service.maps.map import Map
 
 #: Classes of error: upper limit in metres, style class, and text of the legend.
 ERRORS = ((0.5, "e0", "up to 0.5 m"), (1.0, "e1", "up to 1 m"), (5.0, "e2", "up to 5 m"), (np.inf, "e3", "over 5 m"))
 _LONGEST_PX = 1400
 _MARGIN_M = 8.0
+#: Largest number of tiles of a tiled map that are drawn, evenly chosen.
+_MOST_TILES = 64
 #: Surfels are walls if the vertical part of their normal is smaller.
 _UPRIGHT = 0.5
 _GROUND_ID = "ground"
@@ -33,7 +35,7 @@ class Plan:
     view: tuple[float, float, float, float]
 
     @staticmethod
-    def of(bundle: MapBundle) -> "Plan":
+    def of(bundle: Map) -> "Plan":
         """Render the walls of the cloud; without a cloud, the plan only covers the places.
 
         Args:
@@ -41,9 +43,10 @@ class Plan:
         """
         places = bundle.T_map_place[:, :2, 3]
         xy, upright = places, np.zeros(0, bool)
-        if bundle.cloud is not None and len(bundle.cloud.surfels):
-            xy = bundle.cloud.surfels["xyz"][:, :2] + bundle.cloud.origin_m[:2]
-            upright = np.abs(bundle.cloud.surfels["normal"][:, 2]) < _UPRIGHT
+        drawn = () if bundle.cloud is None else bundle.cloud.parts(_MOST_TILES)
+        if any(len(part.surfels) for part in drawn):
+            xy = np.concatenate([part.surfels["xyz"][:, :2] + part.origin_m[:2] for part in drawn])
+            upright = np.concatenate([np.abs(part.surfels["normal"][:, 2]) < _UPRIGHT for part in drawn])
         low = np.minimum(xy.min(axis=0), places.min(axis=0)) - _MARGIN_M
         high = np.maximum(xy.max(axis=0), places.max(axis=0)) + _MARGIN_M
         size = high - low

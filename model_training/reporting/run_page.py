@@ -20,7 +20,7 @@ from model_training.reporting.charts import (
 from model_training.reporting.page import Section, figure, page, table, write_page
 from model_training.reporting.plan import ERRORS, Plan
 from model_training.reporting.queries import Shown, gallery, locate, said_of
-from service.maps.reader import MapBundle
+from service.maps.map import Map
 
 PAGE = "index.html"
 WORST = 20
@@ -43,7 +43,7 @@ _NUMBERS = (
 )
 
 
-def write_run_page(run: SavedRun, bundle: MapBundle, dataset: Dataset, figures: dict[str, Any]) -> Path:
+def write_run_page(run: SavedRun, bundle: Map, dataset: Dataset, figures: dict[str, Any]) -> Path:
     """Write ``index.html`` beside the saved answers and return its path.
 
     Args:

@@ -5,24 +5,28 @@ from collections.abc import Iterator
 import numpy as np
 
 from model_training.viewing.events import Cloud, Event, Outlines, Track
-from service.maps.reader import MapBundle
+from service.maps.map import Map
 from service.maps.streets import Streets
 
+#: Largest number of tiles of a tiled map that are shown, evenly chosen.
+MOST_TILES = 64
 
-def events_of_map(bundle: MapBundle, *, most_points: int) -> Iterator[Event]:
+
+def events_of_map(bundle: Map, *, most_points: int) -> Iterator[Event]:
     """Yield the map's events, all of them always visible.
 
     Args:
         bundle: the map.
         most_points: largest number of points; a larger cloud shows each n-th surfel.
     """
-    if bundle.cloud is not None:
-        surfels = bundle.cloud.surfels[:: max(1, -(-len(bundle.cloud.surfels) // most_points))]
+    drawn = () if bundle.cloud is None else bundle.cloud.parts(MOST_TILES)
+    for number, part in enumerate(drawn):
+        surfels = part.surfels[:: max(1, -(-len(part.surfels) * len(drawn) // most_points))]
         upright = 1 - np.abs(surfels["normal"][:, 2])
         yield Cloud(
-            "map/cloud",
+            "map/cloud" if len(drawn) == 1 else f"map/cloud/{number}",
             None,
-            bundle.cloud.origin_m,
+            part.origin_m,
             surfels["xyz"].astype(np.float32),
             (90 + 150 * upright).astype(np.uint8),
         )

@@ -12,7 +12,7 @@ from model_training.viewing.of_dataset import events_of_dataset
 from model_training.viewing.of_map import events_of_map
 from service.errors import BundleError, DatasetError
 from service.maps import manifest
-from service.maps.reader import MapBundle
+from service.maps.tiles import open_map
 
 
 def events_of(folder: Path, *, most_scans: int, most_points: int) -> Iterator[Event]:
@@ -31,7 +31,7 @@ def events_of(folder: Path, *, most_scans: int, most_points: int) -> Iterator[Ev
         yield from _map_of(run, most_points)
         yield from events_of_answers(run, _dataset_of(run))
     elif (folder / manifest.FILE).is_file():
-        yield from events_of_map(MapBundle.open(folder), most_points=most_points)
+        yield from events_of_map(open_map(folder), most_points=most_points)
     elif (folder / "dataset.json").is_file():
         yield from events_of_dataset(Dataset(folder), most_scans=most_scans, most_points=most_points)
     else:
@@ -44,7 +44,7 @@ def events_of(folder: Path, *, most_scans: int, most_points: int) -> Iterator[Ev
 
 def _map_of(run: SavedRun, most_points: int) -> Iterator[Event]:
     try:
-        bundle = MapBundle.open(Path(run.settings.map.path), verify=False)
+        bundle = open_map(Path(run.settings.map.path), verify=False)
     except BundleError:
         return  # moved or deleted since: the answers can be viewed without the map
     yield from events_of_map(bundle, most_points=most_points)

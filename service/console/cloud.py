@@ -9,7 +9,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.maps.map import Map
-from service.registration.surfel_map import SurfelMap
 from service.registration.surfel_tiles import Cloud
 
 #: ``points`` is rounded down to one of these, so that few clouds are computed and kept.
@@ -59,7 +58,7 @@ def cloud_bytes(cloud: Cloud | None, most: int) -> bytes:
         cloud: cloud of a map; None for a map without a cloud.
         most: most points.
     """
-    parts = _drawn_parts(cloud)
+    parts = () if cloud is None else cloud.parts(MOST_TILES)
     if not any(len(part.surfels) for part in parts):
         return CLOUD_MAGIC + struct.pack("<I6d", 0, *(0.0,) * 3, *(1.0,) * 3)
     origin_m, xyz, upright = parts[0].origin_m, [], []
@@ -75,16 +74,6 @@ def cloud_bytes(cloud: Cloud | None, most: int) -> bytes:
     packed["xyz"] = np.clip(np.rint((positions[rows] - low) / step), 0, _STEPS)
     packed["upright"] = np.rint(np.concatenate(upright)[rows])
     return CLOUD_MAGIC + struct.pack("<I6d", len(rows), *(origin_m + low), *step) + packed.tobytes()
-
-
-def _drawn_parts(cloud: Cloud | None) -> list[SurfelMap]:
-    """Return the surfel maps to draw. A tiled map shows at most ``MOST_TILES`` tiles, evenly chosen."""
-    if cloud is None:
-        return []
-    if isinstance(cloud, SurfelMap):
-        return [cloud]
-    numbers = range(len(cloud.squares_m))
-    return [cloud.cloud_of(number) for number in numbers[:: -(-len(numbers) // MOST_TILES)]]
 
 
 def thinned(surfels: NDArray[Any], tiles: NDArray[np.float64], most: int) -> NDArray[np.intp]:

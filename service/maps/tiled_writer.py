@@ -12,13 +12,17 @@ from service.errors import BundleError
 from service.maps import content as parts
 from service.maps import index, inverted_file, manifest, streets
 from service.maps.calibration import Calibration, Site, read_calibration
-from service.maps.files import map_array, read_file, require_files
+from service.maps.files import json_object, read_file, require_files
 from service.maps.joined_index import JoinedRows
 from service.maps.manifest import TILES_FOLDER, Counts, FileEntry, Manifest, Tile, read_manifest
-from service.maps.tiles import MOST_SEARCHED, differences
+from service.maps.reader import MapBundle
+from service.maps.streets import Streets
+from service.maps.tiles import MOST_SEARCHED, differences, places_in_map, street_numbers
 from service.maps.writer import in_place, json_bytes, link_or_copy, sha256_of, sync
 
 _NEEDED = (parts.ENCODER_FILE, index.FILE, parts.PLACES_FILE, parts.VIEWS_FILE, parts.CALIBRATION_FILE)
+#: Standard deviations of which the map states the largest of all tiles.
+WORST = ("survey_position_std_m", "survey_angle_std_deg")
 _REMEDY = "build all tiles with the same encoder and settings"
 
 
@@ -105,13 +109,26 @@ def _write_shared(
     first, bundles = manifests[0], [folder / tile.folder for tile in tiles]
     names = [parts.ENCODER_FILE, parts.PLACES_FILE, parts.CALIBRATION_FILE]
     link_or_copy(bundles[0] / parts.ENCODER_FILE, folder / parts.ENCODER_FILE)
-    if streets.FILE in first.files:
+    document = joined_streets(
+        [bundle / streets.FILE for bundle, each in zip(bundles, manifests, strict=True) if streets.FILE in each.files]
+    )
+    named = None if document is None else Streets.from_geojson(document)
+    if document is not None:
         names.append(streets.FILE)
-        link_or_copy(bundles[0] / streets.FILE, folder / streets.FILE)
-    places = [map_array(bundle / parts.PLACES_FILE, expected=parts.PLACE) for bundle in bundles]
+        (folder / streets.FILE).write_bytes(json_bytes(document))
+    weights = [tile.counts.places for tile in tiles]
+    lidar_height_m = float(np.average([each.lidar_height_m for each in manifests], weights=weights))
+    if len({each.lidar_height_m for each in manifests}) == 1:
+        lidar_height_m = first.lidar_height_m
+    opened, numbers = (MapBundle.open(bundle, verify=False) for bundle in bundles), street_numbers(named)
+    places = [places_in_map(each, numbers, lidar_height_m) for each in opened]
     np.save(folder / parts.PLACES_FILE, np.concatenate(places), allow_pickle=False)
     (folder / parts.CALIBRATION_FILE).write_bytes(json_bytes(_calibration(bundles)))
     parameters = {key: value for key, value in first.parameters.items() if key in _common(manifests)}
+    parameters["lidar_height_m"] = lidar_height_m
+    for key in WORST:
+        stated = [each.parameters[key] for each in manifests if key in each.parameters]
+        parameters |= {key: max(stated)} if stated else {}
     if len(tiles) > MOST_SEARCHED:
         names.append(inverted_file.FILE)
         arrays = [index.read_descriptors(bundle / index.FILE) for bundle in bundles]
@@ -134,7 +151,7 @@ def _write_shared(
                 views=sum(tile.counts.views for tile in tiles),
                 descriptor_size=first.counts.descriptor_size,
                 cloud_points=sum(tile.counts.cloud_points for tile in tiles),
-                streets=first.counts.streets,
+                streets=0 if named is None else len(named),
             ),
             "files": files,
             "tile_m": tile_m,
@@ -151,6 +168,31 @@ def _common(manifests: Sequence[Manifest]) -> set[str]:
     """Return the names of the parameters that are the same in all tiles."""
     first = manifests[0].parameters
     return {key for key, value in first.items() if all(each.parameters.get(key) == value for each in manifests)}
+
+
+def joined_streets(paths: Sequence[Path]) -> dict[str, Any] | None:
+    """Return the streets of all tiles, each once; None if there is none.
+
+    Args:
+        paths: GeoJSON file of each tile that has streets.
+
+    Raises:
+        BundleError: a file is damaged, or two tiles have different streets of one id.
+    """
+    if not paths:
+        return None
+    joined: dict[str, Any] = {}
+    documents = [json_object(read_file(path), path) for path in paths]
+    for path, document in zip(paths, documents, strict=True):
+        Streets.from_geojson(document)  # checks it
+        for feature in document["features"]:
+            known = joined.setdefault(feature["properties"]["id"], feature)
+            if known != feature:
+                raise BundleError(
+                    f"{path}: the street {feature['properties']['id']!r} is not that of another tile; {_REMEDY}",
+                    field=streets.FILE,
+                )
+    return {**documents[0], "features": list(joined.values())}
 
 
 def _calibration(bundles: Sequence[Path]) -> dict[str, Any]:

@@ -6,10 +6,10 @@ together behave like a map of one bundle.
 
 import threading
 from collections import OrderedDict, defaultdict
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Protocol, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float32, Float64, Int32, Int64
@@ -94,9 +94,12 @@ def open_map(path: Path, *, verify: bool = True) -> Map:
 class OpenTiles:
     """The tiles of a map that are open. The least recently used ones are closed. Several threads may share them.
 
+    A tile that opens gets the street numbers and the nominal LiDAR height of the map.
+
     Args:
         path: folder of the map.
         of_map: manifest of the map.
+        of_streets: streets of the map; None if it has none.
         source: where the tiles come from.
         verify: compare the hash of every file of a tile when it is opened.
         open_bytes: limit of the size of all open tiles, bytes. At least one tile is open.
@@ -106,8 +109,18 @@ class OpenTiles:
         first_place: number of the first place of each tile, and the number of all places.
     """
 
-    def __init__(self, path: Path, of_map: Manifest, source: TileSource, *, verify: bool, open_bytes: int) -> None:
+    def __init__(
+        self,
+        path: Path,
+        of_map: Manifest,
+        of_streets: Streets | None,
+        source: TileSource,
+        *,
+        verify: bool,
+        open_bytes: int,
+    ) -> None:
         self._path, self._manifest, self._source = path, of_map, source
+        self._street_number = street_numbers(of_streets)
         self._verify, self._limit = verify, open_bytes
         self._opened: OrderedDict[int, MapBundle] = OrderedDict()
         self._regions: dict[tuple[int, ...], Map] = {}
@@ -220,7 +233,11 @@ class OpenTiles:
             raise defect(folder / manifest.FILE, f"{different[0]} is not that of the map")
         if bundle.manifest.counts != tile.counts:
             raise defect(folder / manifest.FILE, "the counts are not those that the map lists")
-        return bundle
+        try:
+            places = places_in_map(bundle, self._street_number, self._manifest.lidar_height_m)
+        except KeyError as error:
+            raise defect(folder / streets.FILE, f"the map has no street {error.args[0]!r}") from error
+        return replace(bundle, places=places)
 
 
 def differences(tile: Manifest, of_map: Manifest) -> list[str]:
@@ -230,22 +247,45 @@ def differences(tile: Manifest, of_map: Manifest) -> list[str]:
         tile: manifest of the tile.
         of_map: manifest of the map, or of another tile.
     """
-    shared = (
-        "encoder_sha256",
-        "grid",
-        "headings",
-        "spacing_m",
-        "rows_seen",
-        "georeference",
-        "lidar_height_m",
-        "survey_std",
-    )
+    shared = ("encoder_sha256", "grid", "headings", "spacing_m", "rows_seen", "georeference")
     found = [name for name in shared if getattr(tile, name) != getattr(of_map, name)]
     if tile.counts.descriptor_size != of_map.counts.descriptor_size:
         found.append("counts.descriptor_size")
-    if tile.files.get(streets.FILE) != of_map.files.get(streets.FILE):
-        found.append(streets.FILE)
     return found
+
+
+def street_numbers(of_streets: Streets | None) -> dict[str, int]:
+    """Return the number of each street of a map by its id.
+
+    Args:
+        of_streets: streets of the map; None if it has none.
+    """
+    return {} if of_streets is None else {street.id: number for number, street in enumerate(of_streets.features)}
+
+
+def places_in_map(bundle: MapBundle, street_number: Mapping[str, int], lidar_height_m: float) -> NDArray[Any]:
+    """Return the places of a tile, with the street numbers and the nominal LiDAR height of its map.
+
+    Args:
+        bundle: the tile.
+        street_number: number of each street of the map by its id.
+        lidar_height_m: height of the places of the map above the ground, m.
+
+    Returns:
+        (P,) of ``PLACE``. The array of the tile itself if nothing differs.
+
+    Raises:
+        KeyError: the map has no street of that id.
+    """
+    features = () if bundle.streets is None else bundle.streets.features
+    numbers = np.array([*(street_number[street.id] for street in features), -1], np.int32)  # number -1 takes the last
+    higher_m = lidar_height_m - bundle.manifest.lidar_height_m
+    if not higher_m and np.array_equal(numbers[:-1], np.arange(len(features))):
+        return bundle.places
+    places = np.array(bundle.places)
+    places["street"] = numbers[places["street"]]
+    places["T_map_place"][:, :3, 3] += higher_m * places["T_map_place"][:, :3, 2]
+    return places
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -304,7 +344,8 @@ class TiledMap(Map):
             )
         require_files(path, read, _NEEDED, verify=verify)
         document = read_file(path / streets.FILE) if streets.FILE in read.files else None
-        tiles = OpenTiles(path, read, source or LocalTiles(path), verify=verify, open_bytes=open_bytes)
+        named = None if document is None else Streets.from_geojson(json_object(document, path / streets.FILE))
+        tiles = OpenTiles(path, read, named, source or LocalTiles(path), verify=verify, open_bytes=open_bytes)
         inverted = _inverted(path, read, verify=verify)
         every, sizes = range(len(tiles)), [tile.counts.views for tile in read.tiles]
         rows = JoinedRows(sizes, read.counts.descriptor_size, lambda k: tiles.get(k).view_index.rows)
@@ -316,7 +357,7 @@ class TiledMap(Map):
             places=map_array(path / parts.PLACES_FILE, expected=parts.PLACE),
             views=np.empty(0, parts.VIEW),
             view_index=ViewIndex(rows, inverted or JoinedShortlists(sizes, lambda k: tiles.get(k).view_index)),
-            streets=None if document is None else Streets.from_geojson(json_object(document, path / streets.FILE)),
+            streets=named,
             streets_document=document,
             calibration=read_calibration(
                 read_file(path / parts.CALIBRATION_FILE), path=str(path / parts.CALIBRATION_FILE)

@@ -99,6 +99,14 @@ class SurfelMap:
         """
         return self
 
+    def parts(self, most: int = 1) -> tuple["SurfelMap", ...]:  # noqa: ARG002 - as of SurfelTiles
+        """Return the surfel maps to draw: this one. A tiled map has several (``SurfelTiles.parts``).
+
+        Args:
+            most: largest number of them.
+        """
+        return (self,)
+
     def align(
         self,
         points: QueryPoints,

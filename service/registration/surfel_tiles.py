@@ -36,6 +36,15 @@ class SurfelTiles:
         """
         return self.cloud_of(int(nearest_square(self.squares_m, position_m[None, :2])[0]))
 
+    def parts(self, most: int) -> tuple[SurfelMap, ...]:
+        """Return the surfel maps of some tiles, evenly chosen among all. They overlap at the edges of their squares.
+
+        Args:
+            most: largest number of them.
+        """
+        count = len(self.squares_m)
+        return tuple(self.cloud_of(number) for number in range(0, count, -(-count // most)))
+
     def align(
         self,
         points: QueryPoints,

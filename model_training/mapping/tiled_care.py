@@ -1,0 +1,127 @@
+"""``streetfix map diff`` and ``merge`` of tiled maps: operations on lists of tiles. A tile that is the same stays the same files."""
+
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from model_training.mapping.diff import diff_of
+from model_training.mapping.merge import merge_maps
+from service.errors import BundleError
+from service.maps.manifest import Manifest, Tile, read_manifest
+from service.maps.reader import MapBundle
+from service.maps.tiled_writer import write_tiled
+
+#: Progress callback: stage, finished steps, all steps.
+Report = Callable[[str, int, int], None]
+#: Column and row of a tile.
+Square = tuple[int, int]
+
+
+def tiles_of(read: Manifest) -> dict[Square, Tile]:
+    """Return the tiles of a map by column and row.
+
+    Args:
+        read: manifest of a tiled map.
+    """
+    return {(tile.column, tile.row): tile for tile in read.tiles}
+
+
+def diff_of_tiles(before: Path, after: Path, *, report: Report = lambda *_: None) -> dict[str, Any]:
+    """Return the changes from one tiled map to another as JSON values.
+
+    Only tiles of two versions are opened. ``changed`` has for each of them what ``diff_of`` says of a bundle.
+
+    Args:
+        before: folder of a tiled map.
+        after: folder of another one, with the same squares.
+        report: called after every tile.
+
+    Raises:
+        BundleError: a map is damaged or not tiled, or the edges of the tiles differ.
+    """
+    first, second = _same_squares(before, after)
+    old, new = tiles_of(first), tiles_of(second)
+    both = sorted(old.keys() & new.keys())
+    moved = [square for square in both if old[square].version != new[square].version]
+    changed = []
+    for number, square in enumerate(moved, 1):
+        a, b = (MapBundle.open(path / of[square].folder) for path, of in ((before, old), (after, new)))
+        changed.append({"column": square[0], "row": square[1], **diff_of(a, b)})
+        report("tiles", number, len(moved))
+    return {
+        "versions": [first.version, second.version],
+        "added": sorted(new.keys() - old.keys()),
+        "removed": sorted(old.keys() - new.keys()),
+        "kept": len(both) - len(moved),
+        "changed": changed,
+        "encoder_changed": first.encoder_sha256 != second.encoder_sha256,
+    }
+
+
+def merge_tiled(
+    first: Path,
+    second: Path,
+    out: Path,
+    *,
+    name: str | None = None,
+    overwrite: bool = False,
+    report: Report = lambda *_: None,
+) -> Manifest:
+    """Merge two tiled maps into a new one; return its manifest.
+
+    A square that only one map has keeps its tile. Where both have a tile, ``merge_maps`` merges the two, unless they are the same.
+
+    Args:
+        first: folder of a tiled map.
+        second: folder of another one, with the same squares.
+        out: folder of the new map. It appears complete or not at all.
+        name: name of the new map; None takes the name of the first.
+        overwrite: replace an existing map at ``out``.
+        report: called after every square.
+
+    Raises:
+        DatasetError: two tiles lie too far from each other for one cloud.
+        BundleError: a map is damaged or not tiled, the maps do not fit together, or ``out`` exists and ``overwrite`` is False.
+    """
+    if out.exists() and not overwrite:
+        raise BundleError(f"{out}: already exists; choose another --out, or pass --overwrite", field="out")
+    read, other = _same_squares(first, second)
+    one, two = tiles_of(read), tiles_of(other)
+    squares = sorted(one.keys() | two.keys())
+    out.parent.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(prefix=f".{out.name}.", suffix=".merging", dir=out.parent) as merging:
+        folders: dict[Square, Path] = {}
+        for number, square in enumerate(squares, 1):
+            if square in one and square in two and one[square].version != two[square].version:
+                folders[square] = Path(merging) / f"{square[0]}_{square[1]}"
+                merge_maps(
+                    first / one[square].folder, second / two[square].folder, folders[square], name=name or read.name
+                )
+            else:
+                folders[square] = first / one[square].folder if square in one else second / two[square].folder
+            report("merge", number, len(squares))
+        return write_tiled(out, folders, read.tile_m or 0.0, name=name or read.name, overwrite=overwrite)
+
+
+def _same_squares(first: Path, second: Path) -> tuple[Manifest, Manifest]:
+    """Return the manifests of two tiled maps with the same squares."""
+    read, other = read_manifest(first), read_manifest(second)
+    for path, each in ((first, read), (second, other)):
+        if not each.tiles:
+            raise BundleError(
+                f"{path}: a map of one bundle, but the other map is tiled; build it with --tile-m, or take two maps of one bundle",
+                field="tiles",
+            )
+    if read.tile_m != other.tile_m:
+        raise BundleError(
+            f"tile_m: {first} has {read.tile_m:g} m, {second} has {other.tile_m:g} m; build one of them again with the other's --tile-m",
+            field="tile_m",
+        )
+    if read.georeference != other.georeference:
+        raise BundleError(
+            f"georeference: {first} has {read.georeference}, {second} has {other.georeference}; the squares differ on the ground. Build "
+            "both maps in one frame",
+            field="georeference",
+        )
+    return read, other
