@@ -223,6 +223,13 @@ class OpenTiles:
     def _open(self, tile: Tile) -> MapBundle:
         folder = self._source.folder(tile)
         try:
+            return self._opened_from(folder, tile)
+        except BundleError as error:  # a request may open the tile, and its answer names no folder of the machine
+            message = error.message.replace(str(folder), f"map {self._manifest.name}, {tile.folder}")
+            raise BundleError(message, field=error.field) from error
+
+    def _opened_from(self, folder: Path, tile: Tile) -> MapBundle:
+        try:
             found = sha256_of(folder / manifest.FILE)
         except OSError as error:
             raise defect(folder / manifest.FILE, f"cannot be read ({error.strerror})") from error

@@ -90,7 +90,7 @@ def test_maps_that_do_not_fit_together_are_not_merged(
     with pytest.raises(BundleError, match="a map of one bundle, but the other map is tiled"):
         merge_tiled(halves[0], small_map, tmp_path / "out")
     write_tiled(tmp_path / "large", {(0, 0): squares[sorted(squares)[0]]}, 2 * TILE_M, name="large")
-    with pytest.raises(BundleError, match="has 50 m, .* has 100 m"):
+    with pytest.raises(BundleError, match=r"has 50 m, .* has 100 m"):
         merge_tiled(halves[0], tmp_path / "large", tmp_path / "out")
     with pytest.raises(BundleError, match="already exists"):
         merge_tiled(*halves, halves[0])
