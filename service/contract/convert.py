@@ -346,6 +346,8 @@ def map_entry_from(bundle: Map, versions: Sequence[Localizer]) -> schema.MapEntr
         georeferenced=manifest.georeference is not None,
         licence=manifest.licence,
         versions=[each.bundle.manifest.version for each in versions],
+        tiles=len(manifest.tiles),
+        open_tiles=bundle.open_tiles,
     )
 
 

@@ -746,6 +746,10 @@ class MapEntry(BaseModel):
     georeferenced: bool
     licence: str
     versions: list[str] = Field(description="open versions, the newest first. A request may name one as name@version")
+    tiles: int = Field(0, description="number of tiles of a tiled map; 0 for a map of one bundle")
+    open_tiles: int = Field(
+        0, description="tiles that the answering process has open. A query opens those that it needs"
+    )
 
 
 class ServeVersion(_Strict):
@@ -796,6 +800,10 @@ class Readiness(BaseModel):
     status: Literal["ok"] = "ok"
     refused: list[RefusedBundle] = Field(
         description="map bundles that are not mounted, as this process found them. At most 20; the log lists all"
+    )
+    open_tiles: int = Field(
+        0,
+        description="tiles of tiled maps that this process has open; 0 without a tiled map. The first query in a closed tile is slower",
     )
 
 

@@ -76,6 +76,11 @@ class Map:
         """
         return self
 
+    @property
+    def open_tiles(self) -> int:
+        """Number of open tiles of a tiled map; 0 for a map of one bundle."""
+        return 0
+
     def numbers_of(self, places: Int32[NDArray[np.int32], " n"]) -> Int32[NDArray[np.int32], " n"]:
         """Return the numbers of some places in the whole map: the same. A part of a tiled map has its own indices.
 

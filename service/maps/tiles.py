@@ -376,6 +376,11 @@ class TiledMap(Map):
         _require_consistent(opened)
         return opened
 
+    @property
+    def open_tiles(self) -> int:
+        """Number of open tiles."""
+        return len(self.tiles.opened)
+
     def searched(
         self,
         descriptor: Float32[NDArray[np.float32], " D"],

@@ -208,10 +208,16 @@ class _Maps(Collector):
         maps = GaugeMetricFamily(
             "streetfix_map", "Mounted maps; the value is their number of places.", labels=["map", "version"]
         )
+        tiles = GaugeMetricFamily(
+            "streetfix_open_tiles", "Open tiles of each tiled map in this worker.", labels=["map"]
+        )
         for localizer in self._maps:
             manifest = localizer.bundle.manifest
             maps.add_metric([manifest.name, manifest.version], manifest.counts.places)
+            if manifest.tiles:
+                tiles.add_metric([manifest.name], localizer.bundle.open_tiles)
         yield maps
+        yield tiles
         refused = self._maps.refused
         yield GaugeMetricFamily(
             "streetfix_bundles_refused", "Bundles in the maps folders that are not mounted.", value=len(refused)

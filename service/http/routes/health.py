@@ -44,7 +44,8 @@ def router_for(engine: Engine, version: str) -> APIRouter:
             reasons = "".join(f"; {each.bundle} is not mounted: {each.reason}" for each in refused)
             raise NotReadyError(f"{NO_MAP}{reasons}")
         return schema.Readiness(
-            refused=[schema.RefusedBundle(bundle=each.bundle, reason=each.reason) for each in refused]
+            refused=[schema.RefusedBundle(bundle=each.bundle, reason=each.reason) for each in refused],
+            open_tiles=sum(localizer.bundle.open_tiles for localizer in engine.registry),
         )
 
     @router.get(

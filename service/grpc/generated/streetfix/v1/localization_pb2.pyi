@@ -214,7 +214,7 @@ class ListMapsResponse(_message.Message):
     def __init__(self, maps: _Optional[_Iterable[_Union[MapEntry, _Mapping]]] = ...) -> None: ...
 
 class MapEntry(_message.Message):
-    __slots__ = ("name", "version", "made_at", "places", "views", "streets", "spacing_m", "encoder_sha256", "georeferenced", "licence", "versions")
+    __slots__ = ("name", "version", "made_at", "places", "views", "streets", "spacing_m", "encoder_sha256", "georeferenced", "licence", "versions", "tiles", "open_tiles")
     NAME_FIELD_NUMBER: _ClassVar[int]
     VERSION_FIELD_NUMBER: _ClassVar[int]
     MADE_AT_FIELD_NUMBER: _ClassVar[int]
@@ -226,6 +226,8 @@ class MapEntry(_message.Message):
     GEOREFERENCED_FIELD_NUMBER: _ClassVar[int]
     LICENCE_FIELD_NUMBER: _ClassVar[int]
     VERSIONS_FIELD_NUMBER: _ClassVar[int]
+    TILES_FIELD_NUMBER: _ClassVar[int]
+    OPEN_TILES_FIELD_NUMBER: _ClassVar[int]
     name: str
     version: str
     made_at: str
@@ -237,7 +239,9 @@ class MapEntry(_message.Message):
     georeferenced: bool
     licence: str
     versions: _containers.RepeatedScalarFieldContainer[str]
-    def __init__(self, name: _Optional[str] = ..., version: _Optional[str] = ..., made_at: _Optional[str] = ..., places: _Optional[int] = ..., views: _Optional[int] = ..., streets: _Optional[int] = ..., spacing_m: _Optional[float] = ..., encoder_sha256: _Optional[str] = ..., georeferenced: _Optional[bool] = ..., licence: _Optional[str] = ..., versions: _Optional[_Iterable[str]] = ...) -> None: ...
+    tiles: int
+    open_tiles: int
+    def __init__(self, name: _Optional[str] = ..., version: _Optional[str] = ..., made_at: _Optional[str] = ..., places: _Optional[int] = ..., views: _Optional[int] = ..., streets: _Optional[int] = ..., spacing_m: _Optional[float] = ..., encoder_sha256: _Optional[str] = ..., georeferenced: _Optional[bool] = ..., licence: _Optional[str] = ..., versions: _Optional[_Iterable[str]] = ..., tiles: _Optional[int] = ..., open_tiles: _Optional[int] = ...) -> None: ...
 
 class GetStreetsRequest(_message.Message):
     __slots__ = ("map",)
