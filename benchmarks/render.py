@@ -15,6 +15,7 @@ from benchmarks.report import REPORTS, ROOT, write_report
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
+from matplotlib.figure import Figure
 
 #: Introduction of the page.
 HEAD = """# Reports
@@ -151,11 +152,16 @@ def _reliability(name: str, points: list[dict[str, float]]) -> Path:
     axes.plot([p["confidence"] for p in points], [p["right"] for p in points], "o", color="#2a7f62", ms=5)
     axes.set(xlim=(-0.02, 1.02), ylim=(-0.02, 1.02), aspect="equal", xlabel="confidence", ylabel="share within 1 m")
     axes.grid(alpha=0.3)
-    for side in ("top", "right"):
-        axes.spines[side].set_visible(False)
+    return _saved(figure, f"{name}_reliability.png")
+
+
+def _saved(figure: Figure, name: str, *, dpi: int = 110) -> Path:
+    """Hide the upper and the right border of all panels, write the figure to the reports, and return its file."""
+    for axes in figure.axes:
+        axes.spines[["top", "right"]].set_visible(False)
     figure.tight_layout()
-    path = REPORTS / f"{name}_reliability.png"
-    figure.savefig(path, dpi=110)
+    path = REPORTS / name
+    figure.savefig(path, dpi=dpi)
     plt.close(figure)
     return path
 
@@ -189,15 +195,9 @@ def _accepts(name: str, curves: dict[str, list[list[float]]]) -> Path:
         axes.set_xscale("symlog", linthresh=0.01)
         axes.set_xticks([0, 0.01, 0.1, 1], ["0", "1 %", "10 %", "all"])
         axes.grid(alpha=0.3)
-        for side in ("top", "right"):
-            axes.spines[side].set_visible(False)
     panels[0][0].set_ylabel("accepted and within 1 m")
     panels[0][0].legend(frameon=False, fontsize=8, loc="lower right")
-    figure.tight_layout()
-    path = REPORTS / f"{name}_accepts.png"
-    figure.savefig(path, dpi=120)
-    plt.close(figure)
-    return path
+    return _saved(figure, f"{name}_accepts.png", dpi=120)
 
 
 def _plot(name: str, rows: list[dict[str, Any]]) -> Path | None:
@@ -217,13 +217,7 @@ def _plot(name: str, rows: list[dict[str, Any]]) -> Path | None:
     axes.set_xlim(0, 1.005)
     axes.grid(axis="x", alpha=0.3)
     axes.set_xlabel("share; black mark: the bar")
-    for side in ("top", "right"):
-        axes.spines[side].set_visible(False)
-    figure.tight_layout()
-    path = REPORTS / f"{name}.png"
-    figure.savefig(path, dpi=110)
-    plt.close(figure)
-    return path
+    return _saved(figure, f"{name}.png")
 
 
 if __name__ == "__main__":

@@ -1,7 +1,12 @@
-"""The stages of a request, and a timer that sums their durations."""
+"""The stages of a request, and how long each took.
+
+``timed_request`` marks a request and ``stage`` a part of it. The durations belong to the context of the running code, so concurrent
+requests never share them, and no function passes a timer on. A block costs about 1 us.
+"""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from contextvars import ContextVar
 from time import perf_counter
 from typing import Literal, get_args
 
@@ -9,35 +14,45 @@ Stage = Literal["decode", "fuse", "encode", "search", "register"]
 #: All stages, in their order. ``service.localization.answer.Timings`` says what each contains.
 STAGES: tuple[Stage, ...] = get_args(Stage)
 
+#: Seconds of each stage of the running request; None outside of a request.
+_seconds: ContextVar[dict[Stage, float] | None] = ContextVar("stage_seconds", default=None)
 
-class StageTimer:
-    """Durations of the stages of one request. Every request has its own timer. It is not thread-safe."""
 
-    def __init__(self) -> None:
-        self._seconds = dict.fromkeys(STAGES, 0.0)
+@contextmanager
+def timed_request() -> Iterator[None]:
+    """Measure the stages of one request. It is also a decorator: ``@timed_request()``.
 
-    @contextmanager
-    def stage(self, stage: Stage) -> Iterator[None]:
-        """Add the duration of the block to a stage, also if the block raises an error.
+    A request inside another one adds to the outer one. A new thread starts outside of all requests.
+    """
+    if _seconds.get() is not None:
+        yield
+        return
+    token = _seconds.set(dict.fromkeys(STAGES, 0.0))
+    try:
+        yield
+    finally:
+        _seconds.reset(token)
 
-        Args:
-            stage: stage that the block belongs to.
-        """
-        started = perf_counter()
-        try:
-            yield
-        finally:
-            self._seconds[stage] += perf_counter() - started
 
-    def ms(self, stage: Stage) -> float:
-        """Return the duration of a stage so far, milliseconds.
+@contextmanager
+def stage(name: Stage) -> Iterator[None]:
+    """Add the duration of the block to a stage of the request, also if the block raises an error.
 
-        Args:
-            stage: one of ``STAGES``.
-        """
-        return 1e3 * self._seconds[stage]
+    Outside of a request the block runs unmeasured.
 
-    @property
-    def total_ms(self) -> float:
-        """Duration of all stages so far, milliseconds."""
-        return 1e3 * sum(self._seconds.values())
+    Args:
+        name: stage that the block belongs to.
+    """
+    started = perf_counter()
+    try:
+        yield
+    finally:
+        seconds = _seconds.get()
+        if seconds is not None:
+            seconds[name] += perf_counter() - started
+
+
+def durations_ms() -> dict[Stage, float]:
+    """Return the duration of each stage of the request so far, milliseconds; 0 for all outside of a request."""
+    seconds = _seconds.get() or dict.fromkeys(STAGES, 0.0)
+    return {name: 1e3 * seconds[name] for name in STAGES}

@@ -6,6 +6,7 @@ without it (``cross_check``). Those figures say what a user with a rig of his ow
 
 from dataclasses import dataclass
 
+from model_training.calibration.plans import SEQUENCE
 from model_training.simulation.depth_noise import DepthModel
 from model_training.simulation.plan import CameraPlan, QueryPlan, SimulationPlan
 from model_training.simulation.sensor_parameters import (
@@ -18,8 +19,6 @@ from model_training.training.recipe import CALIBRATION_SEEDS
 
 #: Number of cities for each family. Each serves the other as the map of another city.
 FAMILY_CITIES = 2
-#: Number of frames in a sequence.
-SEQUENCE = 5
 #: Index of the seed of the first family in ``CALIBRATION_SEEDS``. A new family goes to the end of ``FAMILIES``, or the seeds move.
 _FIRST = 100
 #: Exposure above the metered one in the traversals in hard light, stops. Sunlit roads clip there, and stereo matching fails without

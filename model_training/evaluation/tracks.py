@@ -13,7 +13,6 @@ from service.errors import NoDepthError
 from service.geometry.rigid import Transform, transform_from
 from service.localization.localizer import Localizer
 from service.localization.tracker import Track, follow
-from service.timing import StageTimer
 
 #: Progress callback: stage, finished steps, all steps.
 Report = Callable[[str, int, int], None]
@@ -124,14 +123,13 @@ def followed(localizer: Localizer, drives: list[list[Step]], report: Report = la
     for row, drive in enumerate(drives):
         track = Track()
         for column, step in enumerate(drive):
-            timer = StageTimer()
             try:
-                frame = localizer.look_up(step.frame.query(localizer.bundle.grid), timer)
+                frame = localizer.look_up(step.frame.query(localizer.bundle.grid))
             except NoDepthError:
                 track = track.broken()
                 epoch[row, column] = track.epoch
                 continue
-            answer, track = follow(localizer, frame, track, step.T_previous_camera, timer)
+            answer, track = follow(localizer, frame, track, step.T_previous_camera)
             apart = answer.T_map_camera_guess[:2, 3] - _true(step.frame)[:2, 3]
             accepted[row, column] = answer.status == "LOCALIZED"
             error_m[row, column] = float(np.hypot(*apart))

@@ -1,5 +1,6 @@
 """Contrastive losses of paired views."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
@@ -40,14 +41,12 @@ def paired_info_nce(
     Returns:
         Loss of each pair (B), and whether its own survey view is the most similar one (B).
     """
-    forward = _logits(queries, surveys, scale, more_surveys)
-    backward = _logits(surveys, queries, scale, more_queries)
-    own = torch.arange(len(queries.descriptors), device=queries.descriptors.device)
-    loss = 0.5 * (
-        functional.cross_entropy(forward, own, reduction="none")
-        + functional.cross_entropy(backward, own, reduction="none")
-    )
-    return loss, forward.argmax(dim=1) == own
+
+    def one_way(logits: Tensor, own: Tensor) -> Tensor:
+        return functional.cross_entropy(logits, own, reduction="none")
+
+    forward, backward = _logits(queries, surveys, scale, more_surveys), _logits(surveys, queries, scale, more_queries)
+    return _both_ways(forward, backward, one_way)
 
 
 def hardest_triplet(
@@ -65,15 +64,19 @@ def hardest_triplet(
     Returns:
         Loss of each pair (B), and whether its own survey view is the most similar one (B).
     """
-    forward = _logits(queries, surveys, scale, more_surveys)
-    backward = _logits(surveys, queries, scale, more_queries)
-    own = torch.arange(len(queries.descriptors), device=queries.descriptors.device)
 
-    def one_way(logits: Tensor) -> Tensor:
+    def one_way(logits: Tensor, own: Tensor) -> Tensor:
         hardest = logits.scatter(1, own[:, None], -torch.inf).max(dim=1).values
         return functional.softplus(hardest - logits[own, own])
 
-    return 0.5 * (one_way(forward) + one_way(backward)), forward.argmax(dim=1) == own
+    forward, backward = _logits(queries, surveys, scale, more_surveys), _logits(surveys, queries, scale, more_queries)
+    return _both_ways(forward, backward, one_way)
+
+
+def _both_ways(forward: Tensor, backward: Tensor, one_way: Callable[[Tensor, Tensor], Tensor]) -> tuple[Tensor, Tensor]:
+    """Mean of a loss in both directions, and whether the own survey view is the most similar one, for B pairs."""
+    own = torch.arange(len(forward), device=forward.device)
+    return 0.5 * (one_way(forward, own) + one_way(backward, own)), forward.argmax(dim=1) == own
 
 
 def _logits(asked: Side, answers: Side, scale: Tensor, more: Side | None) -> Tensor:

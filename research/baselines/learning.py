@@ -12,6 +12,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 
 from service.errors import DatasetError
@@ -169,6 +170,34 @@ class Training:
         self.curve.append(point)
         write_curve(self.folder / CURVE, self.curve)
         return point
+
+    def spend(
+        self,
+        step: Callable[[], float],
+        *,
+        batch: int,
+        point_every: int,
+        score: Callable[[], float],
+        state: Callable[[], Mapping[str, Any]],
+        progress: Callable[[int, int], None],
+    ) -> None:
+        """Take steps until the budget is spent or the score stopped gaining. Even a short budget gets one step.
+
+        Args:
+            step: takes one step of the optimiser and returns its loss.
+            batch: images of a step.
+            point_every: images between two points of the curve.
+            score: computes the validation score; larger is better.
+            state: returns the state to save.
+            progress: called after each step with the spent budget and 1000, per mille.
+        """
+        while not self.curve or self.ended is None:
+            images, losses = 0, list[float]()
+            while not losses or (images < point_every and self.share_spent < 1.0):
+                losses.append(step())
+                images += batch
+                progress(int(1000 * self.share_spent), 1000)
+            self.point(self.images + images, float(np.mean(losses)), score(), state())
 
     def checkpoint(self) -> dict[str, Any] | None:
         """Load the last saved state; None at the beginning."""

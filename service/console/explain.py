@@ -23,7 +23,7 @@ from service.retrieval.retrieve import Frame
 from service.runtime.engine import EncodedQuery, Engine, Located
 from service.runtime.memory import EXPLAIN_PEAK
 from service.scoring.rendered_depth import REACH_M, SURFEL_M
-from service.timing import StageTimer
+from service.timing import timed_request
 
 _WIDTH, _MAP_WIDTH = 320, 160  # width of depth images, px; in a larger one the gaps between surfels would be visible
 _POINTS_ACROSS = 160  # columns of the query's points in the map
@@ -50,6 +50,7 @@ class Explanation:
     origin_m: Float64[NDArray[np.float64], "3"]
 
 
+@timed_request()
 def explain(engine: Engine, encoded: EncodedQuery) -> Explanation:
     """Localize a query and draw the intermediate images, in the thread of the caller.
 
@@ -61,9 +62,8 @@ def explain(engine: Engine, encoded: EncodedQuery) -> Explanation:
         StreetfixError: as ``Engine.localize``.
     """
     localizer = engine.registry.get(encoded.map_name)
-    timer = StageTimer()
-    frame = engine.look_up(localizer, encoded, timer)
-    located = engine.answer(localizer, (frame,), timer)
+    frame = engine.look_up(localizer, encoded)
+    located = engine.answer(localizer, (frame,))
     answer, bundle = located.answer, located.bundle
     T_map_camera = answer.T_map_camera_guess
     registered = answer.candidates[0].registered if answer.candidates else None

@@ -49,7 +49,7 @@ def create_app(engine: Engine, keys: KeyRing | None = None) -> FastAPI:
             app.include_router(routes)
         for routes in (samples.router_for(engine.settings), answers.router_for(engine)):
             app.include_router(routes)
-    app.include_router(reference.router_for(app))
+    app.include_router(reference.router_for(app, leads_from_root=not engine.settings.console))
     if keys is not None:
         app.add_middleware(AuthMiddleware, keys=keys)
     app.add_middleware(HostMiddleware, hosts=AllowedHosts.of(engine.settings))

@@ -9,7 +9,7 @@ from html import escape
 from typing import Any
 
 from fastapi import APIRouter, FastAPI
-from starlette.responses import HTMLResponse
+from starlette.responses import HTMLResponse, RedirectResponse
 
 #: A page without scripts: styles are inline, nothing else is loaded.
 HEADERS = {
@@ -43,11 +43,12 @@ nav li { margin: 0.15rem 0 }
 """
 
 
-def router_for(app: FastAPI) -> APIRouter:
+def router_for(app: FastAPI, *, leads_from_root: bool) -> APIRouter:
     """Create the route of the page.
 
     Args:
         app: its OpenAPI document is shown.
+        leads_from_root: whether ``/`` redirects to the page too. With a console, ``/`` redirects to the console.
     """
     router = APIRouter(include_in_schema=False)
 
@@ -58,6 +59,13 @@ def router_for(app: FastAPI) -> APIRouter:
     @router.get("/docs", operation_id="getReference")
     async def get_reference() -> HTMLResponse:
         return HTMLResponse(page(), headers=HEADERS)
+
+    if leads_from_root:
+
+        @router.get("/", operation_id="getRoot")
+        async def get_root() -> RedirectResponse:
+            # Relative, because a proxy may put the service below a path of its own. Temporary: a console may be switched on.
+            return RedirectResponse("docs", status_code=307, headers=HEADERS)
 
     return router
 

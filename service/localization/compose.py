@@ -16,7 +16,7 @@ from service.retrieval.hypotheses import Hypothesis
 from service.retrieval.knn import Neighbour
 from service.retrieval.retrieve import Frame, Retrieved
 from service.scoring.candidates import Candidate, Refined
-from service.timing import StageTimer
+from service.timing import durations_ms, stage
 
 #: Largest distance at which a registered pose verifies a place.
 VERIFIED_M = 5.0
@@ -39,7 +39,7 @@ class Found:
     decision: Decision | None
 
 
-def compose(bundle: Map, frames: tuple[Frame, ...], found: Found, extent: Extent, timer: StageTimer) -> Answer:
+def compose(bundle: Map, frames: tuple[Frame, ...], found: Found, extent: Extent) -> Answer:
     """Build an answer from the results of all stages.
 
     Args:
@@ -47,13 +47,12 @@ def compose(bundle: Map, frames: tuple[Frame, ...], found: Found, extent: Extent
         frames: image pairs, the reference first.
         found: places, registered candidates, confidence features and decision.
         extent: extent of the map.
-        timer: of the request. Reasons and spread count as registration.
 
     Raises:
         NotFiniteError: a number of the answer is not finite, because of a defect of this program or of the map.
     """
     retrieved, refined, evidence, decision = found.retrieved, found.refined, found.evidence, found.decision
-    with timer.stage("register"):
+    with stage("register"):  # reasons and spread count as registration
         calibration = None if decision is None else bundle.calibration
         outcome = outcome_of(
             calibration, frames[0].query, refined, evidence, decision, frames=len(frames), extent=extent
@@ -81,20 +80,21 @@ def compose(bundle: Map, frames: tuple[Frame, ...], found: Found, extent: Extent
         measured_share=views.measured_share,
         height_m=views.height_m,
         height_origin=views.height_origin,
-        timings=_timings(timer, registered=refined is not None),
+        timings=_timings(registered=refined is not None),
     )
     require_finite(answer)
     return answer
 
 
-def _timings(timer: StageTimer, *, registered: bool) -> Timings:
+def _timings(*, registered: bool) -> Timings:
+    ms = durations_ms()
     return Timings(
-        decode_ms=timer.ms("decode"),
-        fuse_ms=timer.ms("fuse"),
-        encode_ms=timer.ms("encode"),
-        search_ms=timer.ms("search"),
-        register_ms=timer.ms("register") if registered else 0.0,
-        total_ms=timer.total_ms,
+        decode_ms=ms["decode"],
+        fuse_ms=ms["fuse"],
+        encode_ms=ms["encode"],
+        search_ms=ms["search"],
+        register_ms=ms["register"] if registered else 0.0,
+        total_ms=sum(ms.values()),
     )
 
 

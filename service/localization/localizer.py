@@ -18,7 +18,7 @@ from service.retrieval.encoder import Encoder, Provider
 from service.retrieval.hypotheses import ClusterSettings
 from service.retrieval.query import Query
 from service.retrieval.retrieve import Frame, look_up, require_encoder_of, retrieve
-from service.timing import StageTimer
+from service.timing import stage, timed_request
 
 
 class Localizer:
@@ -75,6 +75,7 @@ class Localizer:
         """
         return self.localize_frames((query,), (np.eye(4),))
 
+    @timed_request()
     def localize_frames(self, queries: tuple[Query, ...], T_reference_camera: tuple[Transform, ...]) -> Answer:
         """Answer several image pairs with known relative poses as one query.
 
@@ -91,44 +92,40 @@ class Localizer:
             RequestError: the calibration does not support such a low false-accept rate.
             NotFiniteError: a number of the answer is not finite, because of a defect of this program or of the map.
         """
-        timer, pairs = StageTimer(), zip(queries, T_reference_camera, strict=True)
-        frames = (replace(self.look_up(query, timer), T_reference_camera=T) for query, T in pairs)
-        return self.answer(tuple(frames), timer)
+        pairs = zip(queries, T_reference_camera, strict=True)
+        return self.answer(tuple(replace(self.look_up(query), T_reference_camera=T) for query, T in pairs))
 
-    def look_up(self, query: Query, timer: StageTimer | None = None) -> Frame:
+    def look_up(self, query: Query) -> Frame:
         """Encode one image pair and search the map for similar views, without registration.
 
         The returned frame is a reference. Set its ``T_reference_camera`` to use it as another frame of a query.
 
         Args:
             query: one image pair, its camera and its options.
-            timer: of the request; None does not measure.
 
         Raises:
             NoDepthError: the depth image holds no measurement within the view grid.
         """
-        return look_up(self.bundle, self.encoder, query, self.clusters, timer or StageTimer())
+        return look_up(self.bundle, self.encoder, query, self.clusters)
 
-    def answer(self, frames: tuple[Frame, ...], timer: StageTimer | None = None) -> Answer:
+    @timed_request()
+    def answer(self, frames: tuple[Frame, ...]) -> Answer:
         """Answer a query from frames that ``look_up`` returned.
 
         Args:
             frames: image pairs, the reference first, as in ``localize_frames``.
-            timer: of the request, with the stages before. None counts only the stages of this call.
 
         Raises:
             RequestError: the calibration does not support such a low false-accept rate.
             NotFiniteError: a number of the answer is not finite, because of a defect of this program or of the map.
         """
-        timer = timer or StageTimer()
-        return self.compose(frames, self.register(frames, timer), timer)
+        return self.compose(frames, self.register(frames))
 
-    def register(self, frames: tuple[Frame, ...], timer: StageTimer, predicted: tuple[Transform, ...] = ()) -> Found:
+    def register(self, frames: tuple[Frame, ...], predicted: tuple[Transform, ...] = ()) -> Found:
         """Retrieve, register and decide, without the parts of an answer that only its reader needs.
 
         Args:
             frames: image pairs, the reference first, as in ``localize_frames``.
-            timer: of the request.
             predicted: poses T_map_camera of the reference from odometry. Registration starts from them too.
 
         Raises:
@@ -139,9 +136,9 @@ class Localizer:
         cloud = bundle.cloud if query.refine else None
         require_promise(bundle.calibration if query.refine else None, query)
         # 1. Retrieval: the most similar places, clusters of the views, and the paper's K-NN vote over the streets.
-        with timer.stage("search"):
+        with stage("search"):
             retrieved = retrieve(bundle, frames[0], self.clusters)
-        with timer.stage("register"):
+        with stage("register"):
             # 2. Registration: refine candidate poses on the map cloud, and rank them.
             refined = None if cloud is None else refine(bundle, cloud, frames, query.prior, self.refining, predicted)
             # 3. Confidence features of the best candidate and its rivals.
@@ -151,19 +148,18 @@ class Localizer:
             decision = None if cloud is None else decision_of(bundle.calibration, query, refined, evidence)
             return Found(retrieved, refined, evidence, decision)
 
-    def compose(self, frames: tuple[Frame, ...], found: Found, timer: StageTimer) -> Answer:
+    def compose(self, frames: tuple[Frame, ...], found: Found) -> Answer:
         """Build the answer.
 
         Args:
             frames: image pairs, the reference first.
             found: result of ``register`` for these frames.
-            timer: of the request.
 
         Raises:
             NotFiniteError: a number of the answer is not finite, because of a defect of this program or of the map.
         """
         # 5. Reasons and spread if the answer is not LOCALIZED. Then the answer, and a check that all its numbers are finite.
-        return compose(self.bundle, frames, found, self.extent, timer)
+        return compose(self.bundle, frames, found, self.extent)
 
 
 def _positions_m(frames: tuple[Frame, ...], predicted: tuple[Transform, ...]) -> Float64[NDArray[np.float64], "n 3"]:

@@ -17,7 +17,7 @@ from service.localization.localizer import Localizer
 from service.option_limits import FALSE_ACCEPT_RATE
 from service.retrieval.retrieve import Frame
 from service.scoring.candidates import RIVAL_M, Candidate, distinct_candidates, shares_of
-from service.timing import StageTimer
+from service.timing import stage, timed_request
 
 #: Maximum number of frames that are registered together. Five frames resolve a street of repeating blocks (decision log).
 MOST_FRAMES = 5
@@ -52,8 +52,9 @@ class Track:
         return Track(epoch=self.epoch + int(self.last is not None))
 
 
+@timed_request()
 def follow(
-    localizer: Localizer, frame: Frame, track: Track, T_previous_camera: Transform | None, timer: StageTimer
+    localizer: Localizer, frame: Frame, track: Track, T_previous_camera: Transform | None
 ) -> tuple[Answer, Track]:
     """Answer the next frame of a robot.
 
@@ -69,7 +70,6 @@ def follow(
         track: of the frames before; ``Track()`` begins.
         T_previous_camera: odometry, from this camera's frame to the previous camera's frame, metres. None: unknown; the track begins
             again.
-        timer: of the request.
 
     Returns:
         The answer with its ``belief`` and ``epoch``, and the track for the next frame.
@@ -91,15 +91,15 @@ def follow(
     is_calibrated = bundle.cloud is not None and bundle.calibration is not None
     if not frame.query.refine or not is_calibrated:  # the frame has no probability
         following = Track(belief.unseen(), track.epoch, last, _window(frame, kept))
-        answer = localizer.answer((frame, *_apart(kept)), timer)
+        answer = localizer.answer((frame, *_apart(kept)))
         return replace(answer, belief=following.belief, epoch=track.epoch) if is_calibrated else answer, following
     predicted = tuple(mode.T_map_camera for mode in belief.modes[:PREDICTED])
-    alone = localizer.register((frame,), timer, predicted)
-    with timer.stage("register"):
+    alone = localizer.register((frame,), predicted)
+    with stage("register"):
         belief = _believed(localizer, frame, alone, belief)
     if _is_overtaken(last, belief):
         kept = ()
-    answer = _answer(localizer, (frame, *_apart(kept)), alone, belief, timer)
+    answer = _answer(localizer, (frame, *_apart(kept)), alone, belief)
     epoch = track.epoch
     if answer.status == "LOCALIZED" and answer.candidates and answer.covariance is not None:
         found = _seen(answer.candidates[0], answer.covariance, probability=answer.confidence or 0.0)
@@ -156,26 +156,26 @@ def _seen(candidate: Candidate, covariance: Float64[NDArray[np.float64], "6 6"],
     return Seen(candidate.T_map_camera, covariance, probability, inliers, similarity)
 
 
-def _answer(localizer: Localizer, frames: tuple[Frame, ...], alone: Found, belief: Belief, timer: StageTimer) -> Answer:
+def _answer(localizer: Localizer, frames: tuple[Frame, ...], alone: Found, belief: Belief) -> Answer:
     """Build the answer from the frame alone, else from all frames together, else from the belief: the first that is accepted."""
     ceiling = partial(_ceiling, alone=alone, belief=belief)
     if _is_localized(alone) and ceiling(alone) > CONTRADICTED:
-        return localizer.compose(frames[:1], alone, timer)
+        return localizer.compose(frames[:1], alone)
     found, used = alone, frames[:1]
     if len(frames) > 1:
-        found, used = localizer.register(frames, timer), frames
+        found, used = localizer.register(frames), frames
         if _is_localized(found) and ceiling(found) > CONTRADICTED:
-            return localizer.compose(frames, found, timer)
+            return localizer.compose(frames, found)
     calibration, mode = localizer.bundle.calibration, belief.modes[0] if belief.modes else None
     if calibration is not None and alone.refined is not None and mode is not None and mode.unseen == 0:
         accepted = Decision("LOCALIZED", mode.weight, 1.0 - belief.outside)
         if mode.weight > MAJORITY and mode.weight >= calibration.threshold(frames[0].query.false_accept_rate):
             refined = alone.refined.led_by(mode.T_map_camera)
-            return localizer.compose(frames[:1], replace(alone, refined=refined, decision=accepted), timer)
+            return localizer.compose(frames[:1], replace(alone, refined=refined, decision=accepted))
     if found.decision is not None and found.decision.status == "LOCALIZED":
         doubted = Decision("AMBIGUOUS", min(found.decision.confidence, ceiling(found)), found.decision.known)
         found = replace(found, decision=doubted)
-    return localizer.compose(used, found, timer)
+    return localizer.compose(used, found)
 
 
 def _is_localized(found: Found) -> bool:

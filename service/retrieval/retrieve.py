@@ -16,7 +16,7 @@ from service.retrieval.encoder import Encoder
 from service.retrieval.hypotheses import ClusterSettings, Hypothesis, cluster, rerank_with_prior
 from service.retrieval.knn import Neighbour, StreetVote, ViewMatches, distinct_places, search_views, vote
 from service.retrieval.query import Query
-from service.timing import StageTimer
+from service.timing import stage
 
 #: A query is searched at three turns, 5 degrees apart. The views of a place are 15 degrees apart, so one of the turns is within
 #: 2.5 degrees of a map view.
@@ -84,7 +84,7 @@ class Retrieved:
     vote: StreetVote | None
 
 
-def look_up(bundle: Map, encoder: Encoder, query: Query, clusters: ClusterSettings, timer: StageTimer) -> Frame:
+def look_up(bundle: Map, encoder: Encoder, query: Query, clusters: ClusterSettings) -> Frame:
     """Encode one image pair and search the map for similar views.
 
     Args:
@@ -92,7 +92,6 @@ def look_up(bundle: Map, encoder: Encoder, query: Query, clusters: ClusterSettin
         encoder: encoder of the map.
         query: image pair, camera and options.
         clusters: settings of the clustering; they give the smallest number of views to find.
-        timer: of the request; the stages "fuse", "encode" and "search".
 
     Returns:
         The image pair as a reference frame: its ``T_reference_camera`` is the identity.
@@ -100,7 +99,7 @@ def look_up(bundle: Map, encoder: Encoder, query: Query, clusters: ClusterSettin
     Raises:
         NoDepthError: the depth image holds no measurement within the view grid.
     """
-    with timer.stage("fuse"):
+    with stage("fuse"):
         views = query_views(
             query.rgb,
             query.depth_m,
@@ -112,9 +111,9 @@ def look_up(bundle: Map, encoder: Encoder, query: Query, clusters: ClusterSettin
             given_height=query.camera_height,
             observed=query.observed,
         )
-    with timer.stage("encode"):
+    with stage("encode"):
         descriptors = encoder.encode(views.planes, side="query")
-    with timer.stage("search"):
+    with stage("search"):
         part = bundle.searched(descriptors.mean(axis=0), near_prior(query))
         matches = search_views(
             part, descriptors, turns_rad=views.turns_rad, places=places_of(query), fewest=clusters.views

@@ -37,7 +37,7 @@ from service.runtime.serving_table import ServingTable
 from service.runtime.settings import Settings
 from service.runtime.threads import limit_pools, usable_cores
 from service.runtime.tracing import Tracing
-from service.timing import StageTimer
+from service.timing import stage, timed_request
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -187,6 +187,7 @@ class Engine:
             return self._continued(encoded, encoded.track)
         return self.localize_sequence((encoded,), (np.eye(4),))
 
+    @timed_request()
     def localize_sequence(
         self, encoded: tuple[EncodedQuery, ...], T_reference_camera: tuple[NDArray[np.float64], ...]
     ) -> Located:
@@ -201,27 +202,27 @@ class Engine:
             StreetfixError: as for ``localize``; with several pairs its field is under ``frames.K``.
         """
         localizer = self.registry.get(encoded[0].map_name)
-        frames, timer = [], StageTimer()
+        frames = []
         for number, (each, T) in enumerate(zip(encoded, T_reference_camera, strict=True)):
             try:
-                frame = self.look_up(localizer, each, timer)
+                frame = self.look_up(localizer, each)
             except StreetfixError as error:
                 if len(encoded) > 1:
                     error.field = f"frames.{number}.{error.field}" if error.field else f"frames.{number}"
                 raise
             frames.append(replace(frame, T_reference_camera=T))
-        return self.answer(localizer, tuple(frames), timer)
+        return self.answer(localizer, tuple(frames))
 
-    def answer(self, localizer: Localizer, frames: tuple[Frame, ...], timer: StageTimer) -> Located:
+    def answer(self, localizer: Localizer, frames: tuple[Frame, ...]) -> Located:
         """Answer frames that were looked up, and count the answer in the metrics.
 
         Args:
             localizer: of the map in which the frames were looked up.
             frames: the reference first.
-            timer: of the request.
         """
-        return self._counted(localizer.answer(frames, timer), localizer)
+        return self._counted(localizer.answer(frames), localizer)
 
+    @timed_request()
     def follow(
         self,
         localizer: Localizer,
@@ -240,8 +241,7 @@ class Engine:
         Raises:
             StreetfixError: as for ``localize``.
         """
-        timer = StageTimer()
-        answer, following = follow(localizer, self.look_up(localizer, encoded, timer), track, T_previous_camera, timer)
+        answer, following = follow(localizer, self.look_up(localizer, encoded), track, T_previous_camera)
         if following.epoch != track.epoch:
             self.metrics.disrupted(localizer.bundle)
         return self._counted(answer, localizer), following
@@ -276,20 +276,19 @@ class Engine:
         content = packed(following, map_version=version)
         return replace(located, sealed_belief=self._seal.sealed(content))
 
-    def look_up(self, localizer: Localizer, encoded: EncodedQuery, timer: StageTimer) -> Frame:
+    def look_up(self, localizer: Localizer, encoded: EncodedQuery) -> Frame:
         """Decode an image pair and retrieve its most similar places.
 
         Args:
             localizer: of the map to search.
             encoded: the pair.
-            timer: of the request.
 
         Raises:
             StreetfixError: as for ``localize``.
         """
-        with timer.stage("decode"):
+        with stage("decode"):
             query = self._decode(encoded, localizer.bundle)
-        return localizer.look_up(query, timer)
+        return localizer.look_up(query)
 
     def close(self) -> None:
         """Wait for running requests and drop waiting ones."""

@@ -9,6 +9,7 @@ finding.
 
 import json
 from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -117,14 +118,14 @@ def train_lk(
         learner = _Learner(pairs, cloud, settings)
         if (state := training.checkpoint()) is not None:
             learner.restore(state)
-        while not training.curve or training.ended is None:  # even a short budget gets one step
-            images, losses = 0, list[float]()
-            while not losses or (images < settings.point_every and training.share_spent < 1.0):
-                losses.append(learner.step(learner.draw(shown), training.share_spent))
-                images += settings.batch
-                report(NAME, int(1000 * training.share_spent), 1000)
-            score = -learner.error_m(watched)
-            training.point(training.images + images, float(np.mean(losses)), score, learner.state())
+        training.spend(
+            lambda: learner.step(learner.draw(shown), training.share_spent),
+            batch=settings.batch,
+            point_every=settings.point_every,
+            score=lambda: -learner.error_m(watched),
+            state=learner.state,
+            progress=partial(report, NAME),
+        )
     return training
 
 

@@ -13,6 +13,7 @@ Such a short run favours small images. Longer runs were not tried.
 
 import json
 from dataclasses import asdict, dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -96,14 +97,14 @@ def train_pose(
         learner = PoseLearner(pairs, MapFrame.of(pairs.T_map_camera[shown, :3, 3]), settings)
         if (state := training.checkpoint()) is not None:
             learner.restore(state)
-        while not training.curve or training.ended is None:  # even a short budget gets one step
-            images, losses = 0, list[float]()
-            while not losses or (images < settings.point_every and training.share_spent < 1.0):
-                losses.append(learner.step(learner.draw(shown), training.share_spent))
-                images += settings.batch
-                report(NAME, int(1000 * training.share_spent), 1000)
-            score = -float(np.median(learner.errors_m(kept_back)))
-            training.point(training.images + images, float(np.mean(losses)), score, learner.state())
+        training.spend(
+            lambda: learner.step(learner.draw(shown), training.share_spent),
+            batch=settings.batch,
+            point_every=settings.point_every,
+            score=lambda: -float(np.median(learner.errors_m(kept_back))),
+            state=learner.state,
+            progress=partial(report, NAME),
+        )
     return training
 
 

@@ -1,6 +1,7 @@
 import pytest
 
-from model_training.calibration.families import FAMILIES, FAMILY_CITIES, SEQUENCE, Family, family_plan
+from model_training.calibration.families import FAMILIES, FAMILY_CITIES, Family, family_plan
+from model_training.calibration.plans import SEQUENCE
 from model_training.simulation.stereo_pair import STEREOS
 
 

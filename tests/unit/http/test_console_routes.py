@@ -158,8 +158,11 @@ def test_switched_off_nothing_of_it_is_there_and_no_answer_is_kept(
 ) -> None:
     engine = Engine.open(Settings(maps=(bundle_path,), threads=1, console=False))
     client = client_of(engine)
-    for path in ("/", "/console", "/console/", "/v1/maps/tiny/cloud", "/v1/samples", "/v1/answers"):
+    for path in ("/console", "/console/", "/v1/maps/tiny/cloud", "/v1/samples", "/v1/answers"):
         assert client.get(path).status_code == 404, path
+    moved = client.get("/")
+    assert (moved.status_code, moved.headers["location"]) == (307, "docs")
+    assert client.get("/docs").status_code == 200
     assert client.post("/v1/localize", files=parts_of()).status_code == 200
     assert engine.last_answers.newest(5) == []
     engine.close()

@@ -22,7 +22,6 @@ from service.retrieval.prior import Prior
 from service.retrieval.query import Query
 from service.retrieval.retrieve import Frame, Retrieved
 from service.scoring.candidates import Candidate, Refined
-from service.timing import StageTimer
 
 LEVEL = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 SMALL = np.diag([0.01**2] * 6)
@@ -54,14 +53,14 @@ class Scripted(Localizer):
         self.bundle: Any = SimpleNamespace(cloud=True, calibration=SimpleNamespace(threshold=lambda _: THRESHOLD))
         self.predicted: list[int] = []
 
-    def register(self, frames: tuple[Frame, ...], timer: StageTimer, predicted: tuple[Any, ...] = ()) -> Found:  # noqa: ARG002
+    def register(self, frames: tuple[Frame, ...], predicted: tuple[Any, ...] = ()) -> Found:
         if len(frames) > 1:
             assert self.together is not None
             return self.together
         self.predicted.append(len(predicted))
         return next(self.alone)
 
-    def compose(self, frames: tuple[Frame, ...], what: Found, timer: StageTimer) -> Any:  # noqa: ARG002
+    def compose(self, frames: tuple[Frame, ...], what: Found) -> Any:
         assert what.refined is not None
         assert what.decision is not None
         return replace(
@@ -96,7 +95,7 @@ def drive(localizer, frame, monkeypatch):
         scripted, track = Scripted(template, alone, together), Track()
         answers: list[tuple[float, str, int, int]] = []
         for number in range(len(alone)):
-            answer, track = follow(scripted, frame, track, AHEAD if number else None, StageTimer())
+            answer, track = follow(scripted, frame, track, AHEAD if number else None)
             answers.append((float(answer.T_map_camera_guess[0, 3]), answer.status, answer.epoch, answer.frames))
             assert len(track.frames) <= MOST_FRAMES - 1
         return answers
@@ -145,7 +144,7 @@ def test_unknown_odometry_begins_an_epoch_if_a_pose_was_given_before(localizer, 
     scripted = Scripted(template, [found(0.2, (0.0, 0.9)), found(0.97, (0.0, 0.99)), found(0.97, (0.0, 0.99))])
     track, epochs = Track(), []
     for _ in range(3):
-        answer, track = follow(scripted, frame, track, None, StageTimer())
+        answer, track = follow(scripted, frame, track, None)
         epochs.append(answer.epoch)
     assert epochs == [0, 0, 1]
 
@@ -153,8 +152,8 @@ def test_unknown_odometry_begins_an_epoch_if_a_pose_was_given_before(localizer, 
 def test_the_modes_are_starts_of_the_next_registration(localizer, frame, monkeypatch):
     monkeypatch.setattr(tracker, "extrapolated", lambda *_: ())
     scripted = Scripted(localizer.answer((frame,)), [found(0.6, (0.0, 0.7), (50.0, 0.3)), found(0.97, (2.0, 0.99))])
-    _, track = follow(scripted, frame, Track(), None, StageTimer())
-    follow(scripted, frame, track, AHEAD, StageTimer())
+    _, track = follow(scripted, frame, Track(), None)
+    follow(scripted, frame, track, AHEAD)
     assert scripted.predicted == [0, 2]
 
 
@@ -166,9 +165,9 @@ def test_a_frame_out_of_range_says_nothing_at_the_default_rate(localizer, frame,
     elsewhere = found(0.8, (50.0, 0.9))
     scripted = Scripted(template, [found(0.97, (0.0, 0.99)), elsewhere], together=elsewhere)
     monkeypatch.setattr(tracker, "extrapolated", lambda *_: ())
-    _, track = follow(scripted, asked, Track(), None, StageTimer())
+    _, track = follow(scripted, asked, Track(), None)
     monkeypatch.setattr(tracker, "extrapolated", lambda *_: (("far", 5.0),))
-    answer, _ = follow(scripted, asked, track, AHEAD, StageTimer())
+    answer, _ = follow(scripted, asked, track, AHEAD)
     assert answer.belief is not None
     first = answer.belief.modes[0]
     if rate == 0.01:
@@ -181,7 +180,7 @@ def test_a_frame_out_of_range_says_nothing_at_the_default_rate(localizer, frame,
 def test_frames_of_one_position_are_not_registered_together(localizer, frame):
     track, counts = Track(), []
     for number in range(4):
-        answer, track = follow(localizer, frame, track, np.eye(4) if number else None, StageTimer())
+        answer, track = follow(localizer, frame, track, np.eye(4) if number else None)
         counts.append(answer.frames)
     assert (counts, len(track.frames)) == ([1, 1, 1, 1], 1)
 
@@ -194,8 +193,8 @@ def test_a_prior_counts_once(localizer, frame, monkeypatch):
     scripted = Scripted(
         localizer.answer((frame,)), [found(0.8, (2.0 * k, 0.99)) for k in range(2)], found(0.5, (2.0, 0.9))
     )
-    first, track = follow(scripted, asked, Track(), None, StageTimer())
-    second, _ = follow(scripted, asked, track, AHEAD, StageTimer())
+    first, track = follow(scripted, asked, Track(), None)
+    second, _ = follow(scripted, asked, track, AHEAD)
     assert first.belief is not None
     assert second.belief is not None
     assert first.belief.modes[0].weight == pytest.approx(0.8)
@@ -206,19 +205,19 @@ def test_a_frame_without_registration_keeps_the_belief(localizer, frame, monkeyp
     monkeypatch.setattr(tracker, "extrapolated", lambda *_: ())
     scripted = Scripted(localizer.answer((frame,)), [found(0.97, (0.0, 0.99)), found(0.97, (100.0, 0.99))])
     scripted.answer = lambda *_: scripted.template  # type: ignore[method-assign]
-    _, track = follow(scripted, frame, Track(), None, StageTimer())
+    _, track = follow(scripted, frame, Track(), None)
     unregistered = replace(frame, query=replace(frame.query, refine=False))
-    plain, track = follow(scripted, unregistered, track, AHEAD, StageTimer())
+    plain, track = follow(scripted, unregistered, track, AHEAD)
     assert plain.belief is track.belief
     assert (track.belief.modes[0].unseen, track.last is None) == (1, False)
-    answer, _ = follow(scripted, frame, track, AHEAD, StageTimer())
+    answer, _ = follow(scripted, frame, track, AHEAD)
     assert answer.epoch == 1
 
 
 def test_a_map_without_calibration_registers_the_last_frames_together(localizer, frame):
     track, counts = Track(), []
     for number in range(MOST_FRAMES + 1):
-        answer, track = follow(localizer, frame, track, AHEAD if number else None, StageTimer())
+        answer, track = follow(localizer, frame, track, AHEAD if number else None)
         counts.append(answer.frames)
         assert answer.belief is None
     assert counts == [1, 2, 3, 4, 5, 5]
@@ -228,7 +227,7 @@ def test_a_carried_track_continues_as_a_kept_one(localizer, frame, monkeypatch):
     monkeypatch.setattr(tracker, "extrapolated", lambda *_: ())
     frames = [found(0.97, (2.0 * k, 0.9), (50.0 + 2 * k, 0.1)) for k in range(2)]
     scripted = Scripted(localizer.answer((frame,)), frames)
-    _, track = follow(scripted, frame, Track(epoch=3), AHEAD, StageTimer())
+    _, track = follow(scripted, frame, Track(epoch=3), AHEAD)
     content = packed(track, map_version="tiny@1")
     carried = unpacked(content, map_version="tiny@1")
     assert len(content) <= MOST_BYTES
@@ -245,6 +244,6 @@ def test_a_carried_track_continues_as_a_kept_one(localizer, frame, monkeypatch):
 def test_a_carried_track_of_another_map_version_begins_an_epoch(localizer, frame, monkeypatch):
     monkeypatch.setattr(tracker, "extrapolated", lambda *_: ())
     scripted = Scripted(localizer.answer((frame,)), [found(0.97, (0.0, 0.9))])
-    _, track = follow(scripted, frame, Track(), None, StageTimer())
+    _, track = follow(scripted, frame, Track(), None)
     other = unpacked(packed(track, map_version="tiny@1"), map_version="tiny@2")
     assert (other.epoch, other.belief.modes, other.last) == (1, (), None)
