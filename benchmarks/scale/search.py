@@ -73,7 +73,7 @@ def search_rows(report: Report, real: RealDescriptors, work: Path, sizes: tuple[
         name = f"search.views_{views}"
         if views <= MOST_SCANNED:
             began = time.perf_counter()
-            copy = ScannedCopy(kept)
+            copy = ScannedCopy.of(kept)
             report.row(f"{name}.scan_open_s", time.perf_counter() - began, "s")
             scanned[views] = _rows(report, f"{name}.scan", copy, numbers, asked, tenth, kept)
         path = work / f"{views}.faiss"

@@ -17,6 +17,8 @@ from service.errors import BundleError
 from service.imaging.npy_header import NPY_HEADER_ERRORS
 
 FILE = "descriptors.npy"
+#: Coarse copy of the descriptors.
+COARSE_FILE = "coarse.faiss"
 #: Largest error of the length of a unit vector.
 LENGTH_OFF = 1e-3
 #: Largest 8-bit number.
@@ -24,11 +26,14 @@ _MOST = 127
 #: Number of principal axes of the coarse copy. With fewer, the list loses similar views (decision 0144).
 _AXES = 64
 #: Smallest number of views for a coarse copy. A scan of fewer exact descriptors takes no longer.
-_FEWEST = 1000
+FEWEST = 1000
 #: Largest number of views that determine the principal axes.
 _SAMPLE = 16_384
 #: Views that are copied at once.
 _CHUNK = 16_384
+
+#: FAISS without its type stubs, which lack many of the classes and fields that this file uses.
+_faiss: Any = faiss
 
 Descriptors = Float32[NDArray[np.float32], "n D"]
 
@@ -127,30 +132,79 @@ class Shortlister(Protocol):
 
 
 class ScannedCopy:
-    """Coarse copy in memory of all descriptors: 8-bit components along the principal axes. A search scans all of it.
+    """Coarse copy of all descriptors: 8-bit components along the principal axes. A search scans all of it.
 
-    The copy is small, so a scan of it hardly waits for memory. The copy of fewer than ``_FEWEST`` views is exact.
+    The copy is small, so a scan of it hardly waits for memory. The copy of fewer than ``FEWEST`` views is exact. A bundle of more views has
+    the copy as a file, so a map opens at once, and the workers of a service share its memory.
 
     Args:
-        numbers: 8-bit descriptors, a row per view.
+        copy: the coarse or exact copy.
+        mean: mean that the copy subtracts from the views.
     """
 
-    def __init__(self, numbers: Rows) -> None:
+    def __init__(self, copy: faiss.Index, mean: Float32[NDArray[np.float32], " D"]) -> None:
+        self._copy, self._mean = copy, mean
+
+    @classmethod
+    def of(cls, numbers: Rows) -> "ScannedCopy":
+        """Make the copy in memory.
+
+        Args:
+            numbers: 8-bit descriptors, a row per view.
+        """
         size = numbers.shape[1]
-        if len(numbers) < _FEWEST:
-            self._copy: faiss.Index = faiss.IndexFlatIP(size)
-            self._mean = np.zeros(size, np.float32)
-            self._copy.add(vectors_of(numbers[:]))
-            return
+        if len(numbers) < FEWEST:
+            exact: faiss.Index = faiss.IndexFlatIP(size)
+            exact.add(vectors_of(numbers[:]))
+            return cls(exact, np.zeros(size, np.float32))
         axes = faiss.PCAMatrix(size, min(_AXES, size))
         codes = faiss.IndexScalarQuantizer(
             axes.d_out, faiss.ScalarQuantizer.QT_8bit_uniform, faiss.METRIC_INNER_PRODUCT
         )
-        self._copy = faiss.IndexPreTransform(axes, codes)
-        self._copy.train(vectors_of(numbers[:: -(-len(numbers) // _SAMPLE)]))
+        copy = faiss.IndexPreTransform(axes, codes)
+        copy.train(vectors_of(numbers[:: -(-len(numbers) // _SAMPLE)]))
         for first in range(0, len(numbers), _CHUNK):
-            self._copy.add(vectors_of(numbers[first : first + _CHUNK]))
-        self._mean = np.array(faiss.vector_to_array(axes.mean), np.float32)
+            copy.add(vectors_of(numbers[first : first + _CHUNK]))
+        return cls(copy, _mean_of(axes))
+
+    def write(self, path: Path) -> None:
+        """Write a coarse copy.
+
+        Args:
+            path: the new file.
+        """
+        _faiss.write_index(self._copy, str(path))
+
+    @classmethod
+    def open(cls, path: Path, *, views: int, dimension: int) -> "ScannedCopy":
+        """Map a coarse copy into memory.
+
+        Args:
+            path: file that ``write`` wrote.
+            views: number of views of the map.
+            dimension: number of components of a descriptor.
+
+        Raises:
+            BundleError: the file is damaged, or belongs to another map.
+        """
+        search_with_one_thread()
+        try:
+            copy = _faiss.read_index(str(path), _faiss.IO_FLAG_MMAP_IFC | _faiss.IO_FLAG_READ_ONLY)
+        except RuntimeError as error:
+            reason = str(error).splitlines()[0].rpartition("Error: ")[2]
+            raise _defect(path, f"not a valid FAISS index ({reason})") from error
+        if not isinstance(copy, _faiss.IndexPreTransform) or copy.chain.size() != 1:
+            raise _defect(path, f"{type(copy).__name__} instead of principal axes with codes")
+        axes, codes = _faiss.downcast_VectorTransform(copy.chain.at(0)), _faiss.downcast_index(copy.index)
+        if not isinstance(axes, _faiss.PCAMatrix) or not isinstance(codes, _faiss.IndexScalarQuantizer):
+            raise _defect(
+                path, f"{type(axes).__name__} and {type(codes).__name__} instead of PCAMatrix and IndexScalarQuantizer"
+            )
+        if copy.ntotal != views or copy.d != dimension or codes.ntotal != views or codes.d != axes.d_out:
+            raise _defect(path, f"{copy.ntotal} views of {copy.d} numbers instead of {views} of {dimension}")
+        if codes.codes.size() != views * codes.code_size:
+            raise _defect(path, "the codes are not those of all views")
+        return cls(copy, _mean_of(axes))
 
     def shortlist(self, descriptor: Float32[NDArray[np.float32], " D"], k: int) -> Int64[NDArray[np.int64], " k"]:
         """Return the indices of approximately the k most similar views, in no particular order.
@@ -165,6 +219,25 @@ class ScannedCopy:
         return found
 
 
+def write_coarse_copy(path: Path, numbers: Rows) -> None:
+    """Make the coarse copy of a map and write it. The same descriptors give the same bytes on processors of one kind.
+
+    Args:
+        path: the new file.
+        numbers: 8-bit descriptors, a row per view, ``FEWEST`` or more.
+    """
+    before = faiss.omp_get_max_threads()
+    faiss.omp_set_num_threads(1)
+    try:
+        ScannedCopy.of(numbers).write(path)
+    finally:
+        faiss.omp_set_num_threads(before)
+
+
+def _mean_of(axes: faiss.PCAMatrix) -> Float32[NDArray[np.float32], " D"]:
+    return np.array(faiss.vector_to_array(axes.mean), np.float32)
+
+
 class ViewIndex:
     """Open descriptors of views. Several threads may search them at the same time.
 
@@ -175,7 +248,7 @@ class ViewIndex:
 
     def __init__(self, numbers: Rows, shortlister: Shortlister | None = None) -> None:
         self._numbers = numbers
-        self._shortlister = shortlister or ScannedCopy(numbers)
+        self._shortlister = shortlister or ScannedCopy.of(numbers)
 
     @classmethod
     def open(cls, path: Path, *, shortlister: Shortlister | None = None) -> "ViewIndex":
@@ -225,3 +298,7 @@ class ViewIndex:
             views: indices of the views.
         """
         return vectors_of(self._numbers[views])
+
+
+def _defect(path: Path, what: str) -> BundleError:
+    return BundleError(f"{path}: {what}; copy or build the bundle again", field=path.name)

@@ -10,7 +10,7 @@ from service.maps import content as parts
 from service.maps import index, inverted_file, streets
 from service.maps.calibration import read_calibration
 from service.maps.files import defect, json_object, map_array, read_file, require_files
-from service.maps.index import ViewIndex
+from service.maps.index import ScannedCopy, Shortlister, ViewIndex
 from service.maps.inverted_file import InvertedFile
 from service.maps.manifest import FILE, TILES_FOLDER, Manifest, read_manifest
 from service.maps.map import Map
@@ -72,16 +72,20 @@ class MapBundle(Map):
 
 
 def _view_index(path: Path, manifest: Manifest, *, verify: bool) -> ViewIndex:
-    inverted = None
+    shortlister: Shortlister | None = None
     if inverted_file.FILE in manifest.files:
-        inverted = InvertedFile.open(
+        shortlister = InvertedFile.open(
             path / inverted_file.FILE,
             views=manifest.counts.views,
             dimension=manifest.counts.descriptor_size,
             headings=manifest.headings,
             verify=verify,
         )
-    return ViewIndex.open(path / index.FILE, shortlister=inverted)
+    elif index.COARSE_FILE in manifest.files:
+        shortlister = ScannedCopy.open(
+            path / index.COARSE_FILE, views=manifest.counts.views, dimension=manifest.counts.descriptor_size
+        )
+    return ViewIndex.open(path / index.FILE, shortlister=shortlister)
 
 
 def _cloud(path: Path, manifest: Manifest, *, verify: bool) -> SurfelMap | None:

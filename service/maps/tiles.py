@@ -83,7 +83,7 @@ def open_map(path: Path, *, verify: bool = True) -> Map:
 
     Args:
         path: folder of the map.
-        verify: compare the hash of every file with the manifest. Those of a tile are compared when the tile is opened.
+        verify: compare the hash of every file with the manifest. Those of a tile are compared when it is first opened.
 
     Raises:
         BundleError: the map is missing, damaged, of another format, or inconsistent.
@@ -101,7 +101,7 @@ class OpenTiles:
         of_map: manifest of the map.
         of_streets: streets of the map; None if it has none.
         source: where the tiles come from.
-        verify: compare the hash of every file of a tile when it is opened.
+        verify: compare the hash of every file of a tile when it is opened for the first time.
         open_bytes: limit of the size of all open tiles, bytes. At least one tile is open.
 
     Attributes:
@@ -122,6 +122,7 @@ class OpenTiles:
         self._path, self._manifest, self._source = path, of_map, source
         self._street_number = street_numbers(of_streets)
         self._verify, self._limit = verify, open_bytes
+        self._verified = set[int]()  # numbers of the tiles whose hashes this process has compared
         self._opened: OrderedDict[int, MapBundle] = OrderedDict()
         self._regions: dict[tuple[int, ...], Map] = {}
         self._changing = threading.Lock()
@@ -158,8 +159,9 @@ class OpenTiles:
         with opening:  # other threads that need this tile wait; those that need others do not
             if (known := self._known(number)) is not None:
                 return known
-            made = self._open(self._manifest.tiles[number])
+            made = self._open(self._manifest.tiles[number], verify=self._verify and number not in self._verified)
             with self._changing:
+                self._verified.add(number)
                 self._opened[number] = made
                 self._close_some()
             return made
@@ -220,22 +222,22 @@ class OpenTiles:
             closed, _ = self._opened.popitem(last=False)
             self._regions = {key: region for key, region in self._regions.items() if closed not in key}
 
-    def _open(self, tile: Tile) -> MapBundle:
+    def _open(self, tile: Tile, *, verify: bool) -> MapBundle:
         folder = self._source.folder(tile)
         try:
-            return self._opened_from(folder, tile)
+            return self._opened_from(folder, tile, verify=verify)
         except BundleError as error:  # a request may open the tile, and its answer names no folder of the machine
             message = error.message.replace(str(folder), f"map {self._manifest.name}, {tile.folder}")
             raise BundleError(message, field=error.field) from error
 
-    def _opened_from(self, folder: Path, tile: Tile) -> MapBundle:
+    def _opened_from(self, folder: Path, tile: Tile, *, verify: bool) -> MapBundle:
         try:
             found = sha256_of(folder / manifest.FILE)
         except OSError as error:
             raise defect(folder / manifest.FILE, f"cannot be read ({error.strerror})") from error
         if found != tile.manifest_sha256:
             raise defect(folder / manifest.FILE, "not the tile that the map lists; the hash does not match")
-        bundle = MapBundle.open(folder, verify=self._verify)
+        bundle = MapBundle.open(folder, verify=verify)
         if different := differences(bundle.manifest, self._manifest):
             raise defect(folder / manifest.FILE, f"{different[0]} is not that of the map")
         if bundle.manifest.counts != tile.counts:
@@ -337,7 +339,7 @@ class TiledMap(Map):
 
         Args:
             path: folder with the manifest and the shared files.
-            verify: compare the hash of every file with the manifest. Those of a tile are compared when the tile is opened.
+            verify: compare the hash of every file with the manifest. Those of a tile are compared when it is first opened.
             source: where the tiles come from; None takes them from ``path``.
             open_bytes: limit of the size of all open tiles, bytes. At least one tile is open.
 

@@ -153,6 +153,10 @@ def _write_files(folder: Path, content: BundleContent) -> Manifest:
             measured[inverted_file.RECALL] = inverted_file.write_inverted_file(path, numbers, headings=content.headings)
 
         writers[inverted_file.FILE] = write_index
+    elif len(content.descriptors) >= index.FEWEST:
+        writers[index.COARSE_FILE] = lambda path: index.write_coarse_copy(
+            path, index.read_descriptors(folder / index.FILE)
+        )
     for name, write in writers.items():
         write(folder / name)
         sync(folder / name)

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from service.errors import BundleError
-from service.maps.index import ViewIndex, write_descriptors
+from service.maps.index import ScannedCopy, ViewIndex, read_descriptors, write_coarse_copy, write_descriptors
 
 
 def unit_vectors(count: int, size: int) -> np.ndarray:
@@ -116,3 +116,48 @@ def test_another_kind_of_array_is_refused(tmp_path: Path, numbers: np.ndarray) -
     np.save(tmp_path / "i.npy", numbers)
     with pytest.raises(BundleError, match=r"instead of int8 with a row per view; copy or build the bundle again"):
         ViewIndex.open(tmp_path / "i.npy")
+
+
+@pytest.fixture
+def coarse(tmp_path: Path) -> Path:
+    write_descriptors(tmp_path / "i.npy", unit_vectors(1500, 32))
+    write_coarse_copy(tmp_path / "coarse.faiss", read_descriptors(tmp_path / "i.npy"))
+    return tmp_path / "coarse.faiss"
+
+
+def test_a_coarse_copy_from_a_file_lists_the_same_views_as_one_in_memory(coarse: Path) -> None:
+    made, read = (
+        ScannedCopy.of(read_descriptors(coarse.parent / "i.npy")),
+        ScannedCopy.open(coarse, views=1500, dimension=32),
+    )
+    for query in unit_vectors(5, 32):
+        np.testing.assert_array_equal(read.shortlist(query, 50), made.shortlist(query, 50))
+
+
+def test_the_same_descriptors_give_the_same_coarse_copy(coarse: Path, tmp_path: Path) -> None:
+    write_coarse_copy(tmp_path / "again.faiss", read_descriptors(tmp_path / "i.npy"))
+    assert (tmp_path / "again.faiss").read_bytes() == coarse.read_bytes()
+
+
+@pytest.mark.parametrize(("views", "dimension"), [(1499, 32), (1500, 31)])
+def test_a_coarse_copy_of_another_map_is_refused(coarse: Path, views: int, dimension: int) -> None:
+    with pytest.raises(BundleError, match=f"1500 views of 32 numbers instead of {views} of {dimension}"):
+        ScannedCopy.open(coarse, views=views, dimension=dimension)
+
+
+def test_another_faiss_index_is_no_coarse_copy(tmp_path: Path) -> None:
+    flat = faiss.IndexFlatIP(8)
+    faiss.write_index(flat, str(tmp_path / "flat.faiss"))
+    with pytest.raises(BundleError, match="IndexFlatIP instead of principal axes with codes"):
+        ScannedCopy.open(tmp_path / "flat.faiss", views=0, dimension=8)
+    other = faiss.IndexPreTransform(faiss.PCAMatrix(8, 4), faiss.IndexFlatIP(4))
+    faiss.write_index(other, str(tmp_path / "other.faiss"))
+    with pytest.raises(BundleError, match=r"PCAMatrix and IndexFlat(IP)? instead of"):
+        ScannedCopy.open(tmp_path / "other.faiss", views=0, dimension=8)
+
+
+@pytest.mark.parametrize("kept", [0, 4, 100, -1])
+def test_a_coarse_copy_that_was_cut_off_is_refused(coarse: Path, kept: int) -> None:
+    coarse.write_bytes(coarse.read_bytes()[:kept])
+    with pytest.raises(BundleError, match=r"coarse.faiss: .*copy or build the bundle again"):
+        ScannedCopy.open(coarse, views=1500, dimension=32)
