@@ -1,4 +1,4 @@
-"""``make bench-scale``: search in maps of up to a hundred towns -> reports/scale.json.
+"""``make bench-scale``: search in maps of up to a hundred towns, and requests on tiled maps -> reports/scale.json.
 
 The first run simulates two small cities and builds their maps, whose descriptors it keeps. A hundred towns need 5 GB of memory and
 2 GB of disk.
@@ -15,11 +15,14 @@ from benchmarks.report import ROOT, Report
 from benchmarks.runs import SIMULATION, Runs, code_hash
 from benchmarks.scale.drawn import DrawnViews
 from benchmarks.scale.search import SIZES, search_rows
+from benchmarks.scale.served import served_rows
 from benchmarks.scale.sources import RealDescriptors, real_descriptors
 from model_training.stock import ENCODER
 from service.maps.index import vectors_of
 from service.retrieval.encoder import Encoder
 
+#: Parts of the report.
+PARTS = ("search", "served")
 #: Code that determines the real descriptors.
 _DESCRIBING = (*SIMULATION, "service/imaging", "benchmarks/scale/sources.py", "model_training/mapping/places.py")
 
@@ -54,15 +57,30 @@ def main() -> None:
         default=SIZES,
         help="numbers of views, 10,000 or more; the rows of other sizes stay",
     )
+    parser.add_argument(
+        "--only",
+        nargs="+",
+        choices=PARTS,
+        default=list(PARTS),
+        help="what to measure: search in drawn maps, requests with a prior on a tiled map (served)",
+    )
     arguments = parser.parse_args()
     if min(arguments.sizes) < 10_000:
         parser.error(f"--sizes: {min(arguments.sizes)} is too small; give 10000 or more")
     arguments.work.mkdir(parents=True, exist_ok=True)
     told = " ".join(sys.argv[1:])
     report = Report("scale", "make bench-scale" + (f' ARGS="{told}"' if told else ""))
-    if tuple(arguments.sizes) != SIZES:
+    if tuple(arguments.sizes) != SIZES or set(arguments.only) != set(PARTS):
         report.keep_others()
-    real = kept_descriptors(arguments.work)
+    if "search" in arguments.only:
+        _search(report, arguments.work, tuple(sorted(arguments.sizes)))
+    if "served" in arguments.only:
+        served_rows(report, Runs(arguments.work, ENCODER), arguments.work)
+        report.write()
+
+
+def _search(report: Report, work: Path, sizes: tuple[int, ...]) -> None:
+    real = kept_descriptors(work)
     whole = DrawnViews(real, len(real.views))
     asked = whole.queries(1_000)
     own = _similarity(real.queries, real.views[real.true_view])
@@ -72,7 +90,7 @@ def main() -> None:
         "(`benchmarks/scale/drawn.py`). The similarity of a query to its own view is "
         f"{own:.3f} in these cities and {drawn:.3f} in drawn maps (median, best of three turns). Times are processor times of one thread."
     )
-    search_rows(report, real, arguments.work, tuple(sorted(arguments.sizes)))
+    search_rows(report, real, work, sizes)
 
 
 if __name__ == "__main__":
