@@ -112,7 +112,13 @@ def key_of_tile(
     whole = (settings.name, settings.licence, settings.passes_vote)
     calibration = "" if settings.calibration is None else settings.calibration.read_bytes().hex()
     return key_of(
-        dataset, encoder_sha256, settings, threads=THREADS, tile=repr(made_of), whole=repr(whole), calibration=calibration
+        dataset,
+        encoder_sha256,
+        settings,
+        threads=THREADS,
+        tile=repr(made_of),
+        whole=repr(whole),
+        calibration=calibration,
     )
 
 
@@ -156,7 +162,13 @@ def build_tile(task: TileTask, share: Share = lambda _: None) -> None:
                 task.part,
             )
             write_from(
-                stages, drive, task.encoder_file, task.folder, calibration, apart, lidar_height_m=task.common.lidar_height_m
+                stages,
+                drive,
+                task.encoder_file,
+                task.folder,
+                calibration,
+                apart,
+                lidar_height_m=task.common.lidar_height_m,
             )
 
 

@@ -75,7 +75,8 @@ def build_tiled(
         run(engine, left, workers=workers, told=told, tell=tell)
         if unseen := [task.name for task in left if not task.is_finished]:
             raise BundleError(
-                f"{unseen[0]}: the finished tile is not in {work.folder}; put --out on a folder that all machines share", field="out"
+                f"{unseen[0]}: the finished tile is not in {work.folder}; put --out on a folder that all machines share",
+                field="out",
             )
         report("joining tiles", 0, 1)
         tiles = {(task.part.square.column, task.part.square.row): task.folder for task in tasks}

@@ -126,7 +126,7 @@ def attempt(task: TileTask, told: Callable[[float], None]) -> Failure | None:
         build_tile(task, share)
     except StreetfixError as error:
         return type(error).__name__, error.message, error.field
-    except Exception as error:  # noqa: BLE001  # the other process raises it again
+    except Exception as error:  # the other process raises it again
         return type(error).__name__, traceback.format_exc(), ""
     return None
 
@@ -141,7 +141,9 @@ def _raise(task: TileTask, failure: Failure) -> None:
     raise RuntimeError(f"{task.name} failed:\n{message}")
 
 
-_LESS_MEMORY = "give fewer --workers or a smaller --tile-m, and run the command again: it goes on with the unfinished tiles"
+_LESS_MEMORY = (
+    "give fewer --workers or a smaller --tile-m, and run the command again: it goes on with the unfinished tiles"
+)
 
 
 def _died(task: TileTask, how: str, attempts: int, most: int, tell: Callable[[str], None]) -> None:
@@ -176,7 +178,7 @@ def _run_local(
                 running.append(_started(tasks, *waiting.popleft()))
             wait([each.pipe for each in running])
             for each in list(running):
-                failure: Failure | None | Literal["died"] = None
+                failure: Failure | Literal["died"] | None = None
                 try:
                     if not each.pipe.poll():
                         continue

@@ -133,7 +133,9 @@ class Drive:
                 report(k + 1)
             before = placed
         keys, moments = points.sums()
-        fields = {name: np.stack([each[name] for each in found]) for name in Places.__slots__} if found else self._none()
+        fields = (
+            {name: np.stack([each[name] for each in found]) for name in Places.__slots__} if found else self._none()
+        )
         return fields | {"keys": keys, "moments": moments}
 
     def cloud_points(self, scan: LevelledScan) -> tuple[NDArray[np.float64], NDArray[np.float32]]:

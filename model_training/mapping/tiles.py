@@ -157,9 +157,7 @@ def tile_parts(
             k = int(np.searchsorted(order, later[way]))
             on_way[k] = (*on_way.get(k, ()), float(share[way]))
         at_scan = (of_scan[order] == (column, row)).all(axis=1)
-        yield TilePart(
-            square, PlannedPlaces(at_scan, on_way), order, travelled[order], given_in.get((column, row), 0)
-        )
+        yield TilePart(square, PlannedPlaces(at_scan, on_way), order, travelled[order], given_in.get((column, row), 0))
 
 
 def _grouped(squares: NDArray[np.int64]) -> dict[tuple[int, int], NDArray[np.int64]]:

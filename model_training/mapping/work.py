@@ -175,7 +175,11 @@ def key_of(
     """
     chosen = {name: value for name, value in asdict(settings).items() if name not in _NOT_IN_PARTS}
     made_of = {
-        "dataset": [type(dataset).__qualname__, dataset.description.model_dump(mode="json"), sorted(dataset.scan_files())],
+        "dataset": [
+            type(dataset).__qualname__,
+            dataset.description.model_dump(mode="json"),
+            sorted(dataset.scan_files()),
+        ],
         "poses": hashlib.sha256(dataset.survey_poses().tobytes()).hexdigest(),
         "encoder": encoder_sha256,
         "settings": chosen,
