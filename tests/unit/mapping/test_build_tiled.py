@@ -29,9 +29,10 @@ from model_training.mapping.work import work_folder
 from service.errors import BundleError, DatasetError, ExtraMissingError
 from service.maps.manifest import read_manifest
 from service.maps.reader import MapBundle
+from service.retrieval.encoder import Encoder
 
 #: 11 scans along 60 m; the map frame's axes cut them into two tiles.
-SETTINGS = BuildSettings(name="tiled", headings=6, spacing_m=5.0, between_m=3.0, calibration=None)
+SETTINGS = BuildSettings(name="tiled", headings=6, spacing_m=5.0, between_m=3.0, voxel_m=0.6, calibration=None)
 TILE_M = 50.0
 
 
@@ -110,17 +111,18 @@ def test_a_tiled_map_has_every_place_of_an_untiled_one_in_its_square(small_datas
     for tile in made.tiles:
         bundle = MapBundle.open(tmp_path / "tiled" / tile.folder)
         assert bundle.manifest.parameters["tile_margin_m"] == TILE_MARGIN_M
-        corner = np.array([tile.column, tile.row]) * TILE_M
-        assert ((bundle.places_xy >= corner) & (bundle.places_xy < corner + TILE_M)).all()
-        views = bundle.view_index.vectors(np.arange(len(bundle.view_place))).reshape(len(bundle.places_xy), -1)
-        rows += list(zip(bundle.places_xy.tolist(), views, strict=True))
-    views = whole.view_index.vectors(np.arange(len(whole.view_place))).reshape(len(whole.places_xy), -1)
-    expected = sorted(zip(whole.places_xy.tolist(), views, strict=True), key=lambda row: row[0])
-    for (xy, vectors), (expected_xy, expected_vectors) in zip(
-        sorted(rows, key=lambda row: row[0]), expected, strict=True
-    ):
-        np.testing.assert_allclose(xy, expected_xy, atol=1e-9)
-        np.testing.assert_array_equal(vectors, expected_vectors)
+        corner, xy = np.array([tile.column, tile.row]) * TILE_M, bundle.T_map_place[:, :2, 3]
+        assert ((xy >= corner) & (xy < corner + TILE_M)).all()
+        rows += places_of(bundle)
+    rows, expected = sorted(rows, key=lambda row: row[0]), sorted(places_of(whole), key=lambda row: row[0])
+    np.testing.assert_allclose([xy for xy, _ in rows], [xy for xy, _ in expected], atol=1e-9)
+    np.testing.assert_array_equal([views for _, views in rows], [views for _, views in expected])
+
+
+def places_of(bundle):
+    """Return the position and the descriptors of each place."""
+    views = bundle.view_index.vectors(np.arange(len(bundle.view_place)))
+    return list(zip(bundle.T_map_place[:, :2, 3].tolist(), views.reshape(len(bundle.T_map_place), -1), strict=True))
 
 
 def test_the_cloud_of_a_tile_is_that_of_an_untiled_map_around_its_square(small_dataset, encoder_file, serial, tmp_path):
@@ -142,7 +144,7 @@ def test_the_cloud_of_a_tile_is_that_of_an_untiled_map_around_its_square(small_d
 def positions_of(cloud):
     """Return the positions of the surfels in the map frame, sorted by voxel."""
     found = cloud.surfels["xyz"].astype(np.float64) + cloud.origin_m
-    return found[np.lexsort(np.floor(found / 0.3).T)]
+    return found[np.lexsort(np.floor(found / SETTINGS.voxel_m).T)]
 
 
 def test_a_survey_of_one_square_gives_a_tiled_map_of_one_tile(small_dataset, encoder_file, serial, tmp_path):
@@ -239,9 +241,13 @@ def test_a_process_that_sees_other_scans_refuses_the_tile(tasks_of, small_datase
 
 def test_an_error_in_another_process_is_raised_as_it_was(tasks_of, small_dataset, tmp_path):
     own = Dataset(shutil.copytree(small_dataset.folder, tmp_path / "own"))
-    (own.folder / "survey" / "scans" / "000003.bin").write_bytes(b"cut")
     task = tasks_of(own)[0]
-    failure = attempt(task, lambda _: None)
+    (own.folder / "survey" / "scans" / "000003.bin").write_bytes(b"cut")
+    part = SurveyPart(own.folder, task.numbers, task.poses)
+    sha256 = Encoder.open(task.encoder_file).sha256
+    failure = attempt(
+        replace(task, key=key_of_tile(part, sha256, task.settings, task.part, task.common)), lambda _: None
+    )
     assert failure is not None
     with pytest.raises(DatasetError, match=r"000003\.bin.*truncated") as refused:
         _raise(task, failure)
@@ -319,9 +325,15 @@ def test_an_interrupted_build_ends_its_processes_and_can_go_on(
 
 @pytest.mark.skipif(importlib.util.find_spec("ray") is None, reason="needs the extra `ray`")
 def test_ray_gives_the_same_bytes(small_dataset, encoder_file, undisturbed, tmp_path):
-    command = [sys.executable, "-c", "from service.cli.start import main; main()", "build-map", str(small_dataset.folder)]
+    command = [
+        sys.executable,
+        "-c",
+        "from service.cli.start import main; main()",
+        "build-map",
+        str(small_dataset.folder),
+    ]
     command += ["--out", str(tmp_path / "m"), "--encoder", str(encoder_file), "--name", "tiled", "--headings", "6"]
-    command += ["--spacing", "5", "--tile-m", f"{TILE_M:g}", "--engine", "ray", "--workers", "2"]
+    command += ["--spacing", "5", "--voxel", "0.6", "--tile-m", f"{TILE_M:g}", "--engine", "ray", "--workers", "2"]
     environment = {name: value for name, value in os.environ.items() if name != "RAY_ADDRESS"}
     done = subprocess.run(command, capture_output=True, text=True, env=environment, timeout=600, check=False)
     assert done.returncode == 0, done.stderr
@@ -331,8 +343,6 @@ def test_ray_gives_the_same_bytes(small_dataset, encoder_file, undisturbed, tmp_
 def test_tiles_check_the_confidence_with_scans_of_their_own(
     small_dataset, encoder_file, calibration_file_of, serial, tmp_path, monkeypatch
 ):
-    from service.retrieval.encoder import Encoder
-
     monkeypatch.setattr(site_check, "_EACH", 2)
     monkeypatch.setattr(site_check, "FEWEST", 1)
     calibration = calibration_file_of(Encoder.open(encoder_file).sha256)
