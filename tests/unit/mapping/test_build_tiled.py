@@ -363,13 +363,19 @@ def test_tiles_check_the_confidence_with_scans_of_their_own(
 def test_an_existing_map_a_wrong_edge_and_a_wrong_engine_are_refused_before_the_work(
     small_dataset, encoder_file, tiled, tmp_path, monkeypatch
 ):
-    def build(out, **options):
+    def build(out, *, tile_m=TILE_M, engine=None, workers=None):
+        def report(*_):
+            pytest.fail("it began")
+
         build_tiled(
             small_dataset,
             encoder_file,
             out,
             SETTINGS,
-            **{"tile_m": TILE_M, "report": lambda *_: pytest.fail("it began")} | options,
+            tile_m=tile_m,
+            engine=engine or "local",
+            workers=workers,
+            report=report,
         )
 
     with pytest.raises(BundleError, match="already exists"):
