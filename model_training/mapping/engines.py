@@ -291,6 +291,9 @@ def _run_ray(
             ray.init(address=address, log_to_driver=False)
         else:
             workers = workers or usual_workers(tasks)
+            os.environ.setdefault(
+                "RAY_worker_niceness", "0"
+            )  # Ray's default of 15 would let every other program go first
             ray.init(address="local", num_cpus=workers, include_dashboard=False, log_to_driver=False)
     pending: dict[Any, tuple[int, int]] = {}
     try:
