@@ -1,7 +1,7 @@
-"""``make bench-scale``: search in maps of up to a hundred towns, and requests on tiled maps -> reports/scale.json.
+"""``make bench-scale``: search in maps of up to a hundred towns, requests on tiled maps, and tiled builds -> reports/scale.json.
 
 The first run simulates two small cities and builds their maps, whose descriptors it keeps. A hundred towns need 5 GB of memory and
-2 GB of disk.
+2 GB of disk. The part ``built`` kills builds and compares both engines. For the second row, install the extra ``ray``.
 """
 
 import argparse
@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from benchmarks.report import ROOT, Report
 from benchmarks.runs import SIMULATION, Runs, code_hash
+from benchmarks.scale.built import built_rows
 from benchmarks.scale.drawn import DrawnViews
 from benchmarks.scale.search import SIZES, search_rows
 from benchmarks.scale.served import served_rows
@@ -22,7 +23,7 @@ from service.maps.index import vectors_of
 from service.retrieval.encoder import Encoder
 
 #: Parts of the report.
-PARTS = ("search", "served")
+PARTS = ("search", "served", "built")
 #: Code that determines the real descriptors.
 _DESCRIBING = (*SIMULATION, "service/imaging", "benchmarks/scale/sources.py", "model_training/mapping/places.py")
 
@@ -62,7 +63,8 @@ def main() -> None:
         nargs="+",
         choices=PARTS,
         default=list(PARTS),
-        help="what to measure: search in drawn maps, requests with a prior on a tiled map (served)",
+        help="what to measure: search in drawn maps, requests with a prior on a tiled map (served), tiled builds that are killed, and both "
+        "engines (built)",
     )
     arguments = parser.parse_args()
     if min(arguments.sizes) < 10_000:
@@ -76,6 +78,9 @@ def main() -> None:
         _search(report, arguments.work, tuple(sorted(arguments.sizes)))
     if "served" in arguments.only:
         served_rows(report, Runs(arguments.work, ENCODER), arguments.work)
+        report.write()
+    if "built" in arguments.only:
+        built_rows(report, Runs(arguments.work, ENCODER))
         report.write()
 
 

@@ -9,6 +9,8 @@ from rich.console import Console
 from model_training.cli.progress import bars
 from model_training.datasets.dataset import MOST_SURVEY_STD_DEG, MOST_SURVEY_STD_M, Dataset
 from model_training.mapping.build import build_map, describe
+from model_training.mapping.build_tiled import build_tiled
+from model_training.mapping.engines import Engine
 from model_training.mapping.settings import BuildSettings
 from model_training.stock import CALIBRATION, ENCODER
 
@@ -91,6 +93,30 @@ def command(
             show_default=False,
         ),
     ] = CALIBRATION,
+    tile_m: Annotated[
+        float | None,
+        typer.Option(
+            help="Build a tiled map with squares of this edge, metres: 50 to 10,000. It is for large surveys: the memory depends on "
+            "a tile, and all cores work.  [default: one bundle]",
+            show_default=False,
+        ),
+    ] = None,
+    engine: Annotated[
+        Engine | None,
+        typer.Option(
+            help="What builds the tiles: processes of this machine, or tasks of Ray (extra `ray`). RAY_ADDRESS names a cluster.  "
+            "[default: local]",
+            show_default=False,
+        ),
+    ] = None,
+    workers: Annotated[
+        int | None,
+        typer.Option(
+            help="Number of tiles at the same time.  [default: one per core, fewer if the memory does not suffice]",
+            min=1,
+            show_default=False,
+        ),
+    ] = None,
     overwrite: Annotated[bool, typer.Option(help="Replace an existing map bundle.")] = False,
 ) -> None:
     """Build a map bundle from a dataset's survey.
@@ -98,9 +124,14 @@ def command(
     The same command resumes a build that was killed at any moment.
 
     \b
-    Example:
+    Examples:
       streetfix build-map data/paper --out maps/paper-city
+      streetfix build-map data/town --out maps/town --tile-m 500
     """
+    if tile_m is None:
+        for option, value in (("--engine", engine), ("--workers", workers)):
+            if value is not None:
+                raise typer.BadParameter("it builds tiles; give --tile-m too", param_hint=option)
     opened = Dataset(dataset)
     settings = BuildSettings(
         name=name or opened.name,
@@ -119,5 +150,19 @@ def command(
         survey_std_deg=survey_std_deg,
     )
     with bars() as report:
-        manifest = build_map(opened, encoder, out, settings, overwrite=overwrite, report=report)
+        if tile_m is None:
+            manifest = build_map(opened, encoder, out, settings, overwrite=overwrite, report=report)
+        else:
+            manifest = build_tiled(
+                opened,
+                encoder,
+                out,
+                settings,
+                tile_m=tile_m,
+                engine=engine or "local",
+                workers=workers,
+                overwrite=overwrite,
+                report=report,
+                tell=lambda text: typer.echo(text, err=True),
+            )
     Console().print(f"{describe(manifest)}: {out}")

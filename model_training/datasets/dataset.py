@@ -4,8 +4,8 @@ Frames are read one at a time. No function loads a whole traversal.
 """
 
 import json
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal, Self
@@ -48,6 +48,9 @@ Transforms = NDArray[np.float64]
 #: File endings of colour images.
 PICTURES = (".jpg", ".jpeg", ".png", ".webp")
 
+
+#: Name, size in bytes and modification time in nanoseconds of a scan's file.
+ScanFile = tuple[str, int, int]
 
 #: Upper limits of ``SurveyAccuracy``.
 MOST_SURVEY_STD_M, MOST_SURVEY_STD_DEG = 5.0, 5.0
@@ -375,6 +378,31 @@ class Dataset:
         finite: NDArray[np.float32] = points[np.isfinite(points[:, :3]).all(axis=1)]
         finite[:, 3] = np.maximum(np.nan_to_num(finite[:, 3], posinf=0.0), 0.0)
         return finite
+
+    def number_in_survey(self, number: int) -> int:
+        """Return the index of a scan in the whole survey. It differs from ``number`` if this dataset is a part of a survey.
+
+        Args:
+            number: number of the scan.
+        """
+        return number
+
+    def scan_files(self) -> Iterator[ScanFile]:
+        """Yield the files of the scans, sorted by name.
+
+        Raises:
+            DatasetError: the folder cannot be read.
+        """
+        folder = self.folder / "survey" / "scans"
+        with reading(folder):
+            found = sorted(folder.iterdir()) if folder.is_dir() else []
+        return self._files_at(found)
+
+    def _files_at(self, paths: Iterable[Path]) -> Iterator[ScanFile]:
+        for path in paths:
+            with reading(path), suppress(FileNotFoundError):  # a scan that is missing is reported when it is read
+                state = path.stat()
+                yield path.name, state.st_size, state.st_mtime_ns
 
     def query_sets(self, *, with_truth: bool = False) -> list[str]:
         """Return the names of the query sets, sorted.

@@ -70,7 +70,7 @@ def aligned(dataset: Dataset, poses: Poses, kept: NDArray[np.int64], *, report: 
     steps = len(kept) * (1 + ROUNDS)
     scans = []
     for done, number in enumerate(kept):
-        scans.append(_thinned(dataset.scan(int(number))[:, :3], int(number)))
+        scans.append(_thinned(dataset.scan(int(number))[:, :3], dataset.number_in_survey(int(number))))
         report("survey", done + 1, steps)
     now = poses[kept].copy()
     for done in range(ROUNDS):

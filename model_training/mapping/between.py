@@ -6,6 +6,7 @@ continues straight on for one more distance, because a sparse survey ends up to 
 figures.
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -61,44 +62,67 @@ def at_scan(placed: PlacedScan) -> Viewpoint:
     return Viewpoint(placed.T_map_level, scan.level.height_m, scan.points, scan.start_rad)
 
 
-def between(one: PlacedScan, other: PlacedScan, largest_m: float) -> list[Viewpoint]:
-    """Return evenly spread viewpoints between two scans, so that no gap exceeds ``largest_m``.
+@dataclass(frozen=True, slots=True, eq=False)
+class PlannedPlaces:
+    """Which places a traversal gets.
 
-    Position and height are interpolated linearly, rotation by slerp. The points are those of both scans.
+    Attributes:
+        at_scan: True for the kept scans that become places (P,).
+        on_way: places between scans: their ``shares_on_way`` by the index of the later of their two kept scans.
+    """
+
+    at_scan: NDArray[np.bool_]
+    on_way: Mapping[int, tuple[float, ...]]
+
+    @classmethod
+    def of(cls, poses: Float64[NDArray[np.float64], "P 4 4"], largest_m: float) -> "PlannedPlaces":
+        """Plan a place at each kept scan, and places between distant scans.
+
+        Args:
+            poses: poses of the kept scans in the order of the traversal.
+            largest_m: largest distance between two places, metres; 0 puts none between scans.
+        """
+        found = {k: shares_on_way(poses, k, largest_m) for k in range(1, len(poses))}
+        return cls(np.ones(len(poses), np.bool_), {k: shares for k, shares in found.items() if shares})
+
+
+def shares_on_way(poses: Float64[NDArray[np.float64], "P 4 4"], k: int, largest_m: float) -> tuple[float, ...]:
+    """Return the positions of the places that scans ``k - 1`` and ``k`` give, along the line from the first to the second.
+
+    0 is the first scan and 1 the second. Shares below 0 and above 1 lie beyond an end of a traversal.
+
+    Args:
+        poses: poses of the kept scans in the order of the traversal.
+        k: index of the second scan, 1 or more.
+        largest_m: largest distance between two places, metres; 0 puts none between scans.
+    """
+    inner = _shares(poses[k - 1], poses[k], largest_m)
+    if not len(inner):
+        return ()
+    steps, shares = np.r_[inner, 1.0], list(inner)
+    if k == 1 or not is_one_way(poses[k - 2], poses[k - 1]):
+        shares += list(-steps)
+    if k == len(poses) - 1 or not is_one_way(poses[k], poses[k + 1]):
+        shares += list(1 + steps)
+    return tuple(float(share) for share in shares)
+
+
+def viewpoint_at(one: PlacedScan, other: PlacedScan, share: float) -> Viewpoint:
+    """Return the viewpoint at a share of the way between two scans, with the points of both.
+
+    Between the scans, position and height are interpolated linearly, and the rotation by slerp. Beyond an end the way goes
+    straight on with the rotation of the scan there.
 
     Args:
         one: a scan and its pose.
         other: the next scan along the way.
-        largest_m: largest distance between two places, metres; 0 puts no place between scans.
-
-    Returns:
-        The viewpoints from ``one`` to ``other``; none if the scans are near enough, or farther apart than ``FARTHEST_M``.
+        share: position on the line between them, as in ``shares_on_way``.
     """
-    return [_viewpoint(one, other, share) for share in _shares(one.T_map_level, other.T_map_level, largest_m)]
-
-
-def beyond(one: PlacedScan, end: PlacedScan, largest_m: float) -> list[Viewpoint]:
-    """Return evenly spread viewpoints behind the last scan of a traversal, as far as that scan is from the scan before it.
-
-    The way goes straight on with the rotation of the last scan. The points are those of both scans.
-
-    Args:
-        one: the last scan but one; the second scan for the beginning of a traversal.
-        end: the last scan; the first scan for the beginning.
-        largest_m: largest distance between two places, metres; 0 puts no place behind the end.
-
-    Returns:
-        The viewpoints, the nearest to ``end`` first; none if there are none between the two scans.
-    """
-    step_m = end.T_map_level[:3, 3] - one.T_map_level[:3, 3]
-    shares = [*_shares(one.T_map_level, end.T_map_level, largest_m), 1.0]
-    if len(shares) == 1:
-        return []
-    positions = [end.T_map_level[:3, 3] + share * step_m for share in shares]
-    return [
-        _rendered((one, end), transform_from(end.T_map_level[:3, :3], position_m), end.scan.level.height_m)
-        for position_m in positions
-    ]
+    if 0 <= share <= 1:
+        return _viewpoint(one, other, share)
+    end, before, further = (one, other, -share) if share < 0 else (other, one, share - 1)
+    position_m = end.T_map_level[:3, 3] + further * (end.T_map_level[:3, 3] - before.T_map_level[:3, 3])
+    return _rendered((before, end), transform_from(end.T_map_level[:3, :3], position_m), end.scan.level.height_m)
 
 
 def is_one_way(T_one: Transform, T_other: Transform) -> bool:

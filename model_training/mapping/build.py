@@ -15,13 +15,14 @@ import numpy as np
 
 from model_training.datasets.dataset import Dataset, Transforms
 from model_training.mapping.calibration_file import calibration_for
-from model_training.mapping.cloud import near, prepared, with_cloud
+from model_training.mapping.cloud import prepared, with_cloud
 from model_training.mapping.join import of_places
 from model_training.mapping.places import Drive, Places, streets_of, views_of
 from model_training.mapping.settings import BuildSettings
 from model_training.mapping.site_check import HeldScan, held_out, site_of
 from model_training.mapping.stages import ResumedStages
 from model_training.mapping.survey import kept_scans, levelled_scans, require_poses_within
+from model_training.mapping.tiles import TILE_MARGIN_M
 from model_training.mapping.voxel_map import VoxelMap, lattice_origin
 from model_training.mapping.work import key_of, work_beside
 from service.errors import BundleError, DatasetError
@@ -63,12 +64,7 @@ def build_map(
         EncoderError: the encoder cannot be used.
         BundleError: ``out`` exists and ``overwrite`` is False, or another process is building it.
     """
-    if out.exists() and not overwrite:  # refuse before the work, not after it
-        raise BundleError(f"{out}: already exists; choose another --out, or pass --overwrite", field="out")
-    if not re.fullmatch(NAME, settings.name):
-        raise DatasetError(
-            f"name: {settings.name!r} cannot name a map; give --name of letters, digits, '.', '_' and '-'", field="name"
-        )
+    require_new(out, settings.name, overwrite=overwrite)
     threads = threads or os.cpu_count() or 1
     encoder = Encoder.open(encoder_file, threads=threads)
     poses, kept = kept_scans(dataset, settings)
@@ -78,31 +74,81 @@ def build_map(
     key = key_of(dataset, encoder.sha256, settings, threads=threads, held_out=len(apart))
     with work_beside(out, key) as work:
         stages = ResumedStages(work, dataset, kept, settings, report)
-        # 1. Rows of the view grid, and poses of the scans.
+        # Rows of the view grid, and poses of the scans.
         grid = ViewGrid(rows=encoder.rows, columns=encoder.columns)
         rows_seen = stages.rows_seen(grid)
         poses = stages.poses(poses)
-        # 2. Places with their map views, and the voxel map of the points.
         drive = Drive(dataset, poses, kept, settings, encoder, grid, rows_seen)
-        places, cloud = stages.places(drive, _cloud_around(poses, settings), apart=apart)
-        content = _content(drive, places, encoder_file)
-        # 3. Confidence on this site, checked with scans that are not in the map yet.
-        if calibration is not None:
-            site = _checked(stages, drive, places, content, cloud, calibration, apart)
-            checked = calibration.model_copy(update={"site": site})
-            content = replace(content, calibration=checked.model_dump(mode="json"))
-        # 4. Dynamic objects: traffic first, then what other passes see through.
-        for wanted, each_scan in ((settings.traffic_vote, True), (settings.passes_vote, False)):
-            if wanted:
-                dynamic = stages.dynamic_voxels(cloud, poses, each_scan=each_scan)
-                cloud.keep(~np.isin(cloud.sums()[0], dynamic))
-        # 5. The bundle.
-        report("writing", 0, 2)
-        content = with_cloud(content, cloud)
-        report("writing", 1, 2)
-        manifest = write_bundle(out, content, overwrite=overwrite)
-        report("writing", 2, 2)
-        return manifest
+        return write_from(stages, drive, encoder_file, out, calibration, apart, overwrite=overwrite)
+
+
+def write_from(
+    stages: ResumedStages,
+    drive: Drive,
+    encoder_file: Path,
+    out: Path,
+    calibration: Calibration | None,
+    apart: Set[int],
+    *,
+    lidar_height_m: float | None = None,
+    overwrite: bool = False,
+) -> Manifest:
+    """Build a bundle from a traversal with its final poses; return the manifest.
+
+    Args:
+        stages: the stages of the build.
+        drive: the traversal, or the part of it that becomes a tile.
+        encoder_file: the encoder, ONNX.
+        out: folder of the bundle.
+        calibration: the calibration of the encoder; None for a map without calibration.
+        apart: indices of the kept scans that the site check holds out.
+        lidar_height_m: height of the LiDAR above the ground, metres; None takes the median of the places.
+        overwrite: replace an existing bundle.
+
+    Raises:
+        DatasetError: a scan is damaged.
+        BundleError: the bundle cannot be written.
+    """
+    # 1. Places with their map views, and the voxel map of the points.
+    places, cloud = stages.places(drive, _cloud_around(drive.poses, drive.settings), apart=apart)
+    content = _content(drive, places, encoder_file, lidar_height_m)
+    # 2. Confidence on this site, checked with scans that are not in the map yet.
+    if calibration is not None:
+        site = _checked(stages, drive, places, content, cloud, calibration, apart)
+        checked = calibration.model_copy(update={"site": site})
+        content = replace(content, calibration=checked.model_dump(mode="json"))
+    # 3. Dynamic objects: traffic first, then what other passes see through.
+    for wanted, each_scan in ((drive.settings.traffic_vote, True), (drive.settings.passes_vote, False)):
+        if wanted:
+            dynamic = stages.dynamic_voxels(cloud, drive.poses, each_scan=each_scan)
+            cloud.keep(~np.isin(cloud.sums()[0], dynamic))
+    # 4. The bundle.
+    stages.report("writing", 0, 2)
+    content = with_cloud(content, cloud)
+    stages.report("writing", 1, 2)
+    manifest = write_bundle(out, content, overwrite=overwrite)
+    stages.report("writing", 2, 2)
+    return manifest
+
+
+def require_new(out: Path, name: str, *, overwrite: bool) -> None:
+    """Refuse an output or a name before the work, not after it.
+
+    Args:
+        out: folder of the bundle.
+        name: name of the map.
+        overwrite: whether an existing bundle may be replaced.
+
+    Raises:
+        BundleError: the folder exists.
+        DatasetError: the name is not valid.
+    """
+    if out.exists() and not overwrite:
+        raise BundleError(f"{out}: already exists; choose another --out, or pass --overwrite", field="out")
+    if not re.fullmatch(NAME, name):
+        raise DatasetError(
+            f"name: {name!r} cannot name a map; give --name of letters, digits, '.', '_' and '-'", field="name"
+        )
 
 
 def _cloud_around(poses: Transforms, settings: BuildSettings) -> VoxelMap:
@@ -110,10 +156,11 @@ def _cloud_around(poses: Transforms, settings: BuildSettings) -> VoxelMap:
     return VoxelMap(settings.voxel_m, lattice_origin(settings.voxel_m, poses[:, :3, 3].mean(axis=0)))
 
 
-def _content(drive: Drive, places: Places, encoder_file: Path) -> BundleContent:
+def _content(drive: Drive, places: Places, encoder_file: Path, lidar_height_m: float | None) -> BundleContent:
     """Return the content of the map without its cloud and its calibration."""
-    dataset, settings = drive.dataset, drive.settings
-    lidar_height_m = float(np.median(places.height_m))
+    dataset, settings, part = drive.dataset, drive.settings, drive.part
+    if lidar_height_m is None:
+        lidar_height_m = float(np.median(places.height_m))
     T_map_place = places.at_height(lidar_height_m)
     streets = dataset.streets()
     votes = {"passes_vote": settings.passes_vote, "traffic_vote": settings.traffic_vote}
@@ -141,9 +188,10 @@ def _content(drive: Drive, places: Places, encoder_file: Path) -> BundleContent:
             "voxel_m": settings.voxel_m,
             "weather_removed": float(settings.remove_weather),
             "expected_lidar_height_m": settings.expected_lidar_height_m,
-            "survey_scans": float(len(drive.poses)),
+            "survey_scans": float(len(drive.poses) if part is None else part.survey_scans),
             "between_m": settings.between_m,
             "places_between": float(places.between),
+            **({} if part is None else {"tile_margin_m": TILE_MARGIN_M}),
             **settings.survey_accuracy(dataset.description.survey_accuracy),
             **done,
         },
@@ -170,16 +218,16 @@ def _checked(
     if not apart:
         return None
     numbers = np.array(sorted(apart))
-    scans = levelled_scans(drive.dataset, drive.kept[numbers], drive.settings)
-    held = [HeldScan(scan.points, places.T_map_level[k]) for k, scan in zip(numbers, scans, strict=True)]
+    scans = list(levelled_scans(drive.dataset, drive.kept[numbers], drive.settings))
+    held = [HeldScan(scan.points, scan.T_map_level(drive.poses[scan.number])) for scan in scans]
 
     def check() -> Site:
         rest = of_places(content, ~places.rendered_from(apart))
         return site_of(replace(rest, cloud=prepared(cloud)), held, calibration, stages.report)
 
     site = stages.site(calibration, check)
-    for scan in held:
-        cloud.add(*near(scan.points, scan.T_map_level))
+    for scan in scans:
+        cloud.add(*drive.cloud_points(scan))
     return site
 
 
@@ -191,7 +239,8 @@ def describe(manifest: Manifest) -> str:
     """
     counts, recall = manifest.counts, manifest.parameters.get(inverted_file.RECALL)
     search = "" if recall is None else f", search index with recall@10 of {recall:.3f} against exact search"
+    tiles = "" if manifest.tile_m is None else f", {len(manifest.tiles)} tiles of {manifest.tile_m:g} m"
     return (
         f"map {manifest.name}, version {manifest.version}: {counts.places} places, {counts.views} views, "
-        f"{counts.cloud_points} cloud points, {counts.streets} street classes{search}"
+        f"{counts.cloud_points} cloud points, {counts.streets} street classes{search}{tiles}"
     )

@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from model_training.datasets.dataset import Dataset
 from model_training.mapping.settings import BuildSettings
 from model_training.mapping.survey import clear_scan, travelled_m
+from model_training.mapping.tiles import TilePart
 from model_training.mapping.voxel_map import VoxelMap
 from model_training.mapping.work import Arrays
 from service.geometry.rigid import inverse, transform_points
@@ -58,12 +59,16 @@ class Passes:
     number: NDArray[np.uint64]
 
     @classmethod
-    def of(cls, poses: NDArray[np.float64], *, spacing_m: float = 1.0) -> "Passes":
+    def of(
+        cls, poses: NDArray[np.float64], *, spacing_m: float = 1.0, travelled: NDArray[np.float64] | None = None
+    ) -> "Passes":
         """Count the passes of a traversal over each tile.
 
         Args:
             poses: T_map_lidar of the scans in the order of the traversal (n, 4, 4).
             spacing_m: usual distance between successive scans, metres. A gap of less than three spacings starts no new pass.
+            travelled: travelled distance from the first scan of the survey to each scan, metres (n,); None computes it from the poses,
+                which must then be the whole traversal.
         """
         half = int(np.ceil(REACH_M / TILE_M)) + 1
         steps = np.arange(-half, half + 1)
@@ -73,7 +78,7 @@ class Passes:
         tiles = np.sort(_numbered(np.floor(poses[:, None, :2, 3] / TILE_M).astype(np.int64) + around), axis=1)
         flat = tiles.ravel()
         order = np.argsort(flat, kind="stable")  # by tile, then in the order of the traversal
-        way = np.repeat(travelled_m(poses), tiles.shape[1])[order]
+        way = np.repeat(travelled_m(poses) if travelled is None else travelled, tiles.shape[1])[order]
         tile = flat[order]
         first = np.r_[True, tile[1:] != tile[:-1]]
         again = np.r_[False, way[1:] - way[:-1] > max(AWAY_M, 3 * spacing_m)] & ~first
@@ -85,14 +90,16 @@ class Passes:
         return cls(tiles, number.reshape(tiles.shape))
 
     @classmethod
-    def each_scan(cls, poses: NDArray[np.float64]) -> "Passes":
+    def each_scan(cls, poses: NDArray[np.float64], order: NDArray[np.int64] | None = None) -> "Passes":
         """Make every scan a pass of its own; scans that are ``MOST`` + 1 scans apart share a number.
 
         Args:
             poses: T_map_lidar of the scans in the order of the traversal (n, 4, 4).
+            order: position of each scan in the whole traversal (n,); None if ``poses`` are the whole traversal.
         """
         tiles = cls.of(poses).tiles
-        number = np.arange(len(poses), dtype=np.uint64)[:, None] % np.uint64(MOST + 1)
+        order = np.arange(len(poses)) if order is None else order
+        number = order.astype(np.uint64)[:, None] % np.uint64(MOST + 1)
         return cls(tiles, np.broadcast_to(number, tiles.shape))
 
     def bits(self, scan: int, tiles: NDArray[np.int64]) -> NDArray[np.uint64]:
@@ -199,6 +206,7 @@ class Vote:
         settings: BuildSettings,
         *,
         each_scan: bool,
+        part: TilePart | None = None,
     ) -> "Vote":
         """Set up a vote.
 
@@ -209,9 +217,14 @@ class Vote:
             numbers: indices of the scans that vote, in the order of the traversal (n,).
             settings: settings of the map: the spacing, and whether weather is removed.
             each_scan: every scan votes on its own.
+            part: the part of the traversal that these scans are; None for all of it.
         """
         T_map_lidar = poses[numbers]
-        passes = Passes.each_scan(T_map_lidar) if each_scan else Passes.of(T_map_lidar, spacing_m=settings.spacing_m)
+        order, travelled = (None, None) if part is None else (part.order, part.travelled_m)
+        if each_scan:
+            passes = Passes.each_scan(T_map_lidar, order)
+        else:
+            passes = Passes.of(T_map_lidar, spacing_m=settings.spacing_m, travelled=travelled)
         return cls(Targets.of(cloud), cloud, dataset, T_map_lidar, numbers, passes, settings, each_scan)
 
     def votes(self, scans: range, report: Callable[[int], None] = lambda _: None) -> Arrays:

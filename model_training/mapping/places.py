@@ -2,16 +2,18 @@
 
 from collections.abc import Callable, Iterable, Set
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from model_training.datasets.dataset import Dataset
-from model_training.mapping.between import PlacedScan, Viewpoint, at_scan, between, beyond, is_one_way
+from model_training.mapping.between import PlacedScan, PlannedPlaces, Viewpoint, at_scan, viewpoint_at
 from model_training.mapping.cloud import near
 from model_training.mapping.settings import BuildSettings
-from model_training.mapping.survey import fan, fan_views, levelled_scans
+from model_training.mapping.survey import LevelledScan, fan, fan_views, levelled_scans
+from model_training.mapping.tiles import TilePart
 from model_training.mapping.voxel_map import VoxelMap
 from model_training.mapping.work import Arrays
 from service.geometry.rigid import heading_of_body
@@ -62,18 +64,19 @@ class Places:
         return T
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, eq=False)
 class Drive:
     """A survey traversal and the settings by which a map is built from it.
 
     Attributes:
         dataset: the dataset with the scans.
         poses: T_map_lidar of all scans (n, 4, 4).
-        kept: indices of the scans that become places (P,).
+        kept: indices of the scans that take part, as places or in the cloud (P,).
         settings: settings of the map.
         encoder: encoder of the map views.
         grid: grid of the map views.
         rows_seen: True for the rows of the grid that the map uses (rows,).
+        part: the part of the survey that becomes a tile of a tiled map; None for all of it.
     """
 
     dataset: Dataset
@@ -83,6 +86,14 @@ class Drive:
     encoder: Encoder
     grid: ViewGrid
     rows_seen: NDArray[np.bool_]
+    part: TilePart | None = None
+
+    @cached_property
+    def plan(self) -> PlannedPlaces:
+        """The places of the traversal."""
+        if self.part is not None:
+            return self.part.plan
+        return PlannedPlaces.of(self.poses[self.kept], self.settings.between_m)
 
     def chunk(
         self,
@@ -113,28 +124,42 @@ class Drive:
             placed = PlacedScan(scan, scan.T_map_level(self.poses[scan.number]))
             if k in scans:
                 if before is not None:
-                    added = self._added(before, placed, k)
-                    found += [self._encoded(viewpoint, (k - 1, k)) for viewpoint in added]
-                found.append(self._encoded(at_scan(placed), (k, k)))
+                    for share in self.plan.on_way.get(k, ()):
+                        found.append(self._encoded(viewpoint_at(before, placed, share), (k - 1, k)))
+                if self.plan.at_scan[k]:
+                    found.append(self._encoded(at_scan(placed), (k, k)))
                 if k not in apart:
-                    points.add(*near(scan.points, placed.T_map_level))
+                    points.add(*self.cloud_points(scan))
                 report(k + 1)
             before = placed
         keys, moments = points.sums()
-        return {name: np.stack([each[name] for each in found]) for name in Places.__slots__} | {
-            "keys": keys,
-            "moments": moments,
-        }
+        fields = (
+            {name: np.stack([each[name] for each in found]) for name in Places.__slots__} if found else self._none()
+        )
+        return fields | {"keys": keys, "moments": moments}
 
-    def _added(self, before: PlacedScan, placed: PlacedScan, k: int) -> list[Viewpoint]:
-        """Return the viewpoints between the kept scans ``k - 1`` and ``k``, and those beyond them where a traversal ends."""
-        largest_m, T_map_lidar = self.settings.between_m, self.poses[self.kept]
-        found = between(before, placed, largest_m)
-        if k == 1 or not is_one_way(T_map_lidar[k - 2], T_map_lidar[k - 1]):
-            found += beyond(placed, before, largest_m)
-        if k == len(self.kept) - 1 or not is_one_way(T_map_lidar[k], T_map_lidar[k + 1]):
-            found += beyond(before, placed, largest_m)
-        return found
+    def cloud_points(self, scan: LevelledScan) -> tuple[NDArray[np.float64], NDArray[np.float32]]:
+        """Return the points of a scan that go into the cloud: positions (m, 3), metres, map frame, and intensities (m,).
+
+        Args:
+            scan: a scan of this traversal.
+        """
+        positions, intensity = near(scan.points, scan.T_map_level(self.poses[scan.number]))
+        if self.part is None:
+            return positions, intensity
+        inside = self.part.is_in_cloud(positions)
+        return positions[inside], intensity[inside]
+
+    def _none(self) -> Arrays:
+        """Return the fields of no place, as ``np.stack`` of those of ``_encoded``."""
+        headings = self.settings.headings
+        return {
+            "T_map_level": np.zeros((0, 4, 4)),
+            "height_m": np.zeros(0),
+            "heading_rad": np.zeros((0, headings)),
+            "descriptors": np.zeros((0, headings, self.encoder.dimension), np.float32),
+            "sources": np.zeros((0, 2), np.int64),
+        }
 
     def _encoded(self, viewpoint: Viewpoint, sources: tuple[int, int]) -> Arrays:
         """Return the fields of one place in ``Places``; its descriptors are (headings, D)."""

@@ -14,6 +14,7 @@ from model_training.mapping.passes import Vote
 from model_training.mapping.places import Drive, Places, gathered
 from model_training.mapping.settings import BuildSettings
 from model_training.mapping.survey import rows_seen_by
+from model_training.mapping.tiles import TilePart
 from model_training.mapping.voxel_map import VoxelMap
 from model_training.mapping.work import Arrays, Work
 from service.imaging.view_grid import ViewGrid
@@ -33,6 +34,7 @@ class ResumedStages:
         kept: indices of the scans that become places (P,).
         settings: settings of the map.
         report: called after every scan of each stage.
+        part: the part of the survey that becomes a tile; None for all of it.
     """
 
     work: Work
@@ -40,6 +42,7 @@ class ResumedStages:
     kept: NDArray[np.int64]
     settings: BuildSettings
     report: Report
+    part: TilePart | None = None
 
     def rows_seen(self, grid: ViewGrid) -> NDArray[np.bool_]:
         """Return which rows of the view grid the LiDAR covers (rows,).
@@ -86,7 +89,7 @@ class ResumedStages:
             each_scan: every scan votes on its own, not with its pass. This finds traffic.
             earlier: keys of the voxels that were in the map before this survey (k,).
         """
-        vote = Vote.of(cloud, self.dataset, poses, self.kept, self.settings, each_scan=each_scan)
+        vote = Vote.of(cloud, self.dataset, poses, self.kept, self.settings, each_scan=each_scan, part=self.part)
         name, stage = ("traffic", "traffic") if each_scan else ("votes", "passes")
         told = partial(self._told, stage)
         return vote.removed(self.work.chunks(name, len(self.kept), partial(vote.votes, report=told), told), earlier)

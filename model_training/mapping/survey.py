@@ -175,9 +175,7 @@ def clear_scan(dataset: Dataset, number: int, settings: BuildSettings) -> NDArra
 def rows_seen_by(
     dataset: Dataset, kept: NDArray[np.int64], grid: ViewGrid, settings: BuildSettings, *, sample: int = 100
 ) -> NDArray[np.bool_]:
-    """Return which rows of the view grid the survey's LiDAR covers (rows,), from a sample of its scans.
-
-    The other rows are also removed from query views.
+    """Return which rows of the view grid the survey's LiDAR covers (rows,), as ``sampled_survey``.
 
     Args:
         dataset: the dataset with the survey.
@@ -189,10 +187,33 @@ def rows_seen_by(
     Raises:
         DatasetError: the LiDAR covers no row.
     """
+    return sampled_survey(dataset, kept, grid, settings, sample=sample)[0]
+
+
+def sampled_survey(
+    dataset: Dataset, kept: NDArray[np.int64], grid: ViewGrid, settings: BuildSettings, *, sample: int = 100
+) -> tuple[NDArray[np.bool_], float]:
+    """Return what an evenly spread sample of the scans shows about the survey's LiDAR.
+
+    Args:
+        dataset: the dataset with the survey.
+        kept: indices of the scans that become places (P,).
+        grid: the view grid.
+        settings: settings of the map.
+        sample: approximate number of scans in the sample.
+
+    Returns:
+        Which rows of the view grid the LiDAR covers (rows,), and the median of its height above the ground, metres. The other rows are
+        also removed from query views.
+
+    Raises:
+        DatasetError: the LiDAR covers no row.
+    """
     chosen = kept[:: max(1, len(kept) // sample)]
-    measured = np.zeros(grid.rows)
+    measured, heights_m = np.zeros(grid.rows), []
     for scan in levelled_scans(dataset, chosen, settings):
         measured += (panorama_from_points(scan.points, grid)[0] > 0).mean(axis=1)
+        heights_m.append(scan.level.height_m)
     seen: NDArray[np.bool_] = measured / len(chosen) > SEEN_SHARE
     if not seen.any():
         raise DatasetError(
@@ -200,4 +221,4 @@ def rows_seen_by(
             f"of elevation within {grid.max_range_m:g} m: check units and axes (metres, z up)",
             field="survey",
         )
-    return seen
+    return seen, float(np.median(heights_m))

@@ -10,6 +10,7 @@ import hashlib
 import json
 import os
 import shutil
+import time
 import zipfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -25,7 +26,6 @@ from numpy.typing import NDArray
 import model_training
 import service
 from model_training.datasets.dataset import Dataset
-from model_training.datasets.files import reading
 from model_training.mapping.settings import BuildSettings
 from service.errors import BundleError
 
@@ -92,7 +92,9 @@ class Work:
 
 
 @contextmanager
-def work_beside(out: Path, key: str) -> Iterator[Work]:
+def work_beside(
+    out: Path, key: str, *, also: Callable[[str], bool] = lambda _: False, wait_s: float = 0.0
+) -> Iterator[Work]:
     """Provide the store of an output as a context, locked against other processes.
 
     The folder is removed at the end of the context. After an exception it stays if it holds a finished part.
@@ -100,13 +102,15 @@ def work_beside(out: Path, key: str) -> Iterator[Work]:
     Args:
         out: folder of the bundle.
         key: hash of all inputs of the build. Parts of another key are removed.
+        also: returns whether something else with a given name may stay in the folder.
+        wait_s: how long to wait for another process that works on the output, seconds.
 
     Raises:
         BundleError: another process works on the same output, or the folder cannot be written.
     """
     folder = work_folder(out)
     try:
-        lock = _locked(folder, out)
+        lock = _locked(folder, out, wait_s)
     except OSError as error:
         raise BundleError(
             f"{folder}: the intermediate results of the build cannot be stored ({error.strerror}); free "
@@ -115,8 +119,8 @@ def work_beside(out: Path, key: str) -> Iterator[Work]:
         ) from error
     with lock:
         for path in folder.iterdir():
-            if path.name != _LOCK and not path.name.endswith(f"-{key}.npz"):
-                path.unlink()
+            if path.name != _LOCK and not path.name.endswith(f"-{key}.npz") and not also(path.name):
+                remove(path)
         # A killed writer left these folders. No other process uses them, because this one holds the lock.
         for partial in out.parent.glob(f".{out.name}.*.partial"):
             shutil.rmtree(partial)
@@ -127,6 +131,18 @@ def work_beside(out: Path, key: str) -> Iterator[Work]:
                 shutil.rmtree(folder)
             raise
         shutil.rmtree(folder)
+
+
+def remove(path: Path) -> None:
+    """Remove a file or a folder with all that it contains.
+
+    Args:
+        path: the file or folder.
+    """
+    if path.is_dir():
+        shutil.rmtree(path)
+    else:
+        path.unlink()
 
 
 def work_folder(out: Path) -> Path:
@@ -157,16 +173,13 @@ def key_of(
     Raises:
         DatasetError: the folder of the scans cannot be read.
     """
-    folder = dataset.folder / "survey" / "scans"
-    with reading(folder):
-        scans = (
-            sorted((scan.name, scan.stat().st_size, scan.stat().st_mtime_ns) for scan in os.scandir(folder))
-            if folder.is_dir()
-            else []
-        )
     chosen = {name: value for name, value in asdict(settings).items() if name not in _NOT_IN_PARTS}
     made_of = {
-        "dataset": [type(dataset).__qualname__, dataset.description.model_dump(mode="json"), scans],
+        "dataset": [
+            type(dataset).__qualname__,
+            dataset.description.model_dump(mode="json"),
+            sorted(dataset.scan_files()),
+        ],
         "poses": hashlib.sha256(dataset.survey_poses().tobytes()).hexdigest(),
         "encoder": encoder_sha256,
         "settings": chosen,
@@ -190,13 +203,16 @@ def _code() -> str:
 
 
 _LOCK = "lock"
+#: Time between two attempts to take a lock, seconds.
+_AGAIN_S = 0.1
 
 
-def _locked(folder: Path, out: Path) -> IO[str]:
-    """Take the lock of a work folder.
+def _locked(folder: Path, out: Path, wait_s: float) -> IO[str]:
+    """Take the lock of a work folder; wait some seconds for another holder.
 
     The operating system releases the lock however its holder ends. So a new build can take over the folder of a killed one.
     """
+    until = time.monotonic() + wait_s
     while True:
         folder.mkdir(parents=True, exist_ok=True)
         path = folder / _LOCK
@@ -204,6 +220,10 @@ def _locked(folder: Path, out: Path) -> IO[str]:
         try:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError as error:
+            if time.monotonic() < until:
+                lock.close()
+                time.sleep(_AGAIN_S)
+                continue
             lock.seek(0)
             holder = lock.read().strip() or "?"
             lock.close()

@@ -30,6 +30,7 @@ EXTRA_OF_PACKAGE = {
     "kiss_icp": "odometry",
     "small_gicp": "mapping",
     "carla": "carla",
+    "ray": "ray",
     "cyclonedds": "ros2",
     "rerun": "view",
     "foxglove": "view",

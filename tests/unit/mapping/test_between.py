@@ -3,7 +3,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from model_training.mapping.between import FARTHEST_M, PlacedScan, at_scan, between, beyond
+from model_training.mapping.between import FARTHEST_M, PlacedScan, PlannedPlaces, at_scan, shares_on_way, viewpoint_at
 from model_training.mapping.survey import LevelledScan
 from service.geometry.rigid import inverse, rotation_z, transform_from, transform_points
 from service.imaging.pca import Level
@@ -18,6 +18,18 @@ def placed(x_m, *, yaw_rad=0.0, height_m=1.7, intensity=10.0):
     points = np.c_[transform_points(inverse(T_map_level), POINTS_MAP), np.full(3, intensity)].astype(np.float32)
     level = Level(np.eye(3), height_m)
     return PlacedScan(LevelledScan(0, points, level, 0.0), T_map_level)
+
+
+def between(one, other, largest_m):
+    """Return the viewpoints between two scans in the middle of a traversal."""
+    way = np.stack([one.T_map_level, one.T_map_level, other.T_map_level, other.T_map_level])
+    return [viewpoint_at(one, other, share) for share in shares_on_way(way, 2, largest_m)]
+
+
+def beyond(one, end, largest_m):
+    """Return the viewpoints behind the end of a traversal, which the second scan is."""
+    way = np.stack([one.T_map_level, one.T_map_level, end.T_map_level])
+    return [viewpoint_at(one, end, share) for share in shares_on_way(way, 2, largest_m) if share > 1]
 
 
 def test_a_place_half_way_has_the_mean_pose_and_the_points_of_both_scans():
@@ -76,8 +88,17 @@ def test_the_way_goes_straight_on_for_one_more_distance_at_its_end(apart_m, at_m
 
 
 def test_the_beginning_of_a_way_goes_on_backwards():
-    found = beyond(placed(4.0, height_m=1.7), placed(0.0, height_m=1.7), 3.0)
+    first, second = placed(0.0, height_m=1.7), placed(4.0, height_m=1.7)
+    way = np.stack([first.T_map_level, second.T_map_level, second.T_map_level])
+    found = [viewpoint_at(first, second, share) for share in shares_on_way(way, 1, 3.0) if share < 0]
     assert [each.T_map_level[0, 3] for each in found] == pytest.approx([-2.0, -4.0])
+
+
+def test_each_scan_becomes_a_place_and_each_gap_is_planned_once():
+    way = np.stack([placed(x_m).T_map_level for x_m in (0.0, 4.0, 6.0, 10.0, 40.0, 44.0)])
+    plan = PlannedPlaces.of(way, 3.0)
+    assert plan.at_scan.all()
+    assert dict(plan.on_way) == {1: (0.5, -0.5, -1.0), 3: (0.5, 1.5, 2.0), 5: (0.5, -0.5, -1.0, 1.5, 2.0)}
 
 
 def test_a_place_at_a_scan_is_the_scan():

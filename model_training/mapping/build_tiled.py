@@ -1,0 +1,170 @@
+"""Build a tiled map: plan the tiles, build each of them, and put them together."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from model_training.datasets.dataset import Dataset
+from model_training.datasets.survey_part import SurveyPart
+from model_training.mapping.build import Report, require_new
+from model_training.mapping.build_tile import THREADS, CommonValues, TileTask, key_of_tile
+from model_training.mapping.calibration_file import calibration_for
+from model_training.mapping.engines import Engine, require_engine, run
+from model_training.mapping.settings import BuildSettings
+from model_training.mapping.survey import kept_scans, sampled_survey
+from model_training.mapping.tiles import require_tile_edge, tile_parts
+from model_training.mapping.work import Work, key_of, remove, work_beside
+from service.errors import BundleError
+from service.imaging.view_grid import ViewGrid
+from service.maps.manifest import Manifest
+from service.maps.tiled_writer import write_tiled
+from service.retrieval.encoder import Encoder
+
+#: Start of the name of a tile's folder among the parts of a build.
+_TILE = "tile_"
+
+
+def build_tiled(
+    dataset: Dataset,
+    encoder_file: Path,
+    out: Path,
+    settings: BuildSettings,
+    *,
+    tile_m: float,
+    engine: Engine = "local",
+    workers: int | None = None,
+    overwrite: bool = False,
+    report: Report = lambda *_: None,
+    tell: Callable[[str], None] = lambda _: None,
+) -> Manifest:
+    """Build a tiled map, or continue a killed build; return the manifest.
+
+    The finished tiles stay beside the output until the map is complete. A tile is built again only if its own scans, the settings or
+    the code have changed. The number of processes and the engine do not change the result.
+
+    Args:
+        dataset: the dataset with the survey.
+        encoder_file: the encoder, ONNX. The map gets a copy.
+        out: folder of the map. It appears complete or not at all.
+        settings: settings of the map.
+        tile_m: edge of the tiles, metres.
+        engine: runs the tiles: ``local`` in processes of this machine, ``ray`` as tasks of Ray.
+        workers: number of tiles at the same time; None takes as many as cores and memory allow.
+        overwrite: replace an existing map.
+        report: progress callback.
+        tell: called with a line of text if a process dies.
+
+    Raises:
+        DatasetError: the survey is empty or damaged, or ``tile_m``, ``workers`` or the name is not valid.
+        ExtraMissingError: the engine is not installed.
+        EncoderError: the encoder cannot be used.
+        BundleError: ``out`` exists and ``overwrite`` is False, another process is building it, or the processes of a tile died.
+    """
+    require_new(out, settings.name, overwrite=overwrite)
+    require_tile_edge(tile_m)
+    require_engine(engine, workers)
+    encoder = Encoder.open(encoder_file, threads=THREADS)
+    calibration_for(settings.calibration, encoder.sha256)  # refuse a damaged file before the work
+    with work_beside(out, key_of(dataset, encoder.sha256, settings, threads=THREADS), also=_is_of_tile) as work:
+        tasks = _tasks(dataset, encoder, encoder_file, settings, tile_m, work, report)
+        _remove_others(work, tasks)
+        left = [task for task in tasks if not task.is_finished]
+        told = _Progress(tasks, left, report)
+        run(engine, left, workers=workers, told=told, tell=tell)
+        if unseen := [task.name for task in left if not task.is_finished]:
+            raise BundleError(
+                f"{unseen[0]}: the finished tile is not in {work.folder}; put --out on a folder that all machines share",
+                field="out",
+            )
+        report("joining tiles", 0, 1)
+        tiles = {(task.part.square.column, task.part.square.row): task.folder for task in tasks}
+        manifest = write_tiled(out, tiles, tile_m, name=settings.name, overwrite=overwrite)
+        report("joining tiles", 1, 1)
+        return manifest
+
+
+def _tasks(
+    dataset: Dataset,
+    encoder: Encoder,
+    encoder_file: Path,
+    settings: BuildSettings,
+    tile_m: float,
+    work: Work,
+    report: Report,
+) -> list[TileTask]:
+    """Plan the tiles: which scans and places each of them has, and what all have in common."""
+    poses, kept = kept_scans(dataset, settings)
+    parts = list(tile_parts(poses, kept, tile_m=tile_m, between_m=settings.between_m))
+    grid = ViewGrid(rows=encoder.rows, columns=encoder.columns)
+
+    def sampled() -> dict[str, Any]:
+        seen, height_m = sampled_survey(dataset, kept, grid, settings)
+        return {"rows_seen": seen, "lidar_height_m": np.array(height_m)}
+
+    found = work.part("common", sampled)
+    common = CommonValues(found["rows_seen"], float(found["lidar_height_m"]))
+    tasks = []
+    for done, part in enumerate(parts):
+        numbers = kept[part.order]
+        of_tile = SurveyPart(dataset.folder, numbers, poses[numbers])
+        key = key_of_tile(of_tile, encoder.sha256, settings, part, common)
+        folder = work.folder / f"{_TILE}{part.square.column}_{part.square.row}_{key}"
+        tasks.append(
+            TileTask(
+                dataset.folder.resolve(),
+                encoder_file.resolve(),
+                settings,
+                numbers,
+                poses[numbers],
+                part,
+                common,
+                key,
+                folder.resolve(),
+            )
+        )
+        report("planning tiles", done + 1, len(parts))
+    return tasks
+
+
+def _is_of_tile(name: str) -> bool:
+    """Return whether a name among the parts of a build is that of a tile, or of the parts of a tile."""
+    return name.removeprefix(".").startswith(_TILE)
+
+
+def _remove_others(work: Work, tasks: list[TileTask]) -> None:
+    """Remove the tiles of other inputs, and their parts."""
+    wanted = {task.folder.name for task in tasks}
+    for path in work.folder.iterdir():
+        if _is_of_tile(path.name) and not any(path.name.removeprefix(".").startswith(name) for name in wanted):
+            remove(path)
+
+
+class _Progress:
+    """Add up the progress of the tiles, in scans.
+
+    Args:
+        tasks: all tiles.
+        left: the tiles to build.
+        report: progress callback.
+    """
+
+    def __init__(self, tasks: list[TileTask], left: list[TileTask], report: Report) -> None:
+        self._scans = np.array([len(task.numbers) for task in left], np.float64)
+        self._shares = np.zeros(len(left))
+        self._total = sum(len(task.numbers) for task in tasks)
+        self._before = self._total - int(self._scans.sum())
+        self._stage = f"scans of {len(tasks)} tiles"
+        self._report = report
+        self._report(self._stage, self._before, self._total)
+
+    def __call__(self, index: int, share: float) -> None:
+        """Store the progress of a tile and report the sum.
+
+        Args:
+            index: index of the tile among those to build.
+            share: its finished share, 0 to 1.
+        """
+        self._shares[index] = max(share, self._shares[index])
+        self._report(self._stage, self._before + int(self._scans @ self._shares), self._total)

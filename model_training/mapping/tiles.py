@@ -1,0 +1,178 @@
+"""Divide a survey into the tiles of a map: squares of the ground in the map frame.
+
+The given poses decide, before anything is aligned. So each kept scan is in exactly one square, and the tiles do not depend on each
+other. A place between two scans is in the square of its interpolated position.
+
+A tile reads three nested areas:
+
+- Its square has its places.
+- The square plus ``TILE_MARGIN_M`` has its cloud.
+- The square plus ``SCANS_MARGIN_M`` has its scans. These are all scans that measure the cloud. So no surface of the cloud lacks a scan.
+"""
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from model_training.mapping.between import PlannedPlaces
+from model_training.mapping.cloud import CLOUD_REACH_M
+from model_training.mapping.survey import travelled_m
+from service.errors import DatasetError
+from service.maps.manifest import LARGEST_TILE_M, MOST_TILES, SMALLEST_TILE_M
+
+#: How far the cloud of a tile reaches beyond its square, metres. Depth and map views end at 40 m (``MAX_RANGE_M``), and the rendering of
+#: the map at a pose reads 45 m (``rendered_depth.REACH_M``). A camera stands up to some metres from the place that answers it.
+TILE_MARGIN_M = 50.0
+#: How far the scans of a tile lie beyond its square, metres. Farther scans have no point in the cloud.
+SCANS_MARGIN_M = TILE_MARGIN_M + CLOUD_REACH_M
+
+
+@dataclass(frozen=True, slots=True, order=True)
+class Square:
+    """A square of the ground.
+
+    Attributes:
+        column: it has the positions with ``column * tile_m <= x < (column + 1) * tile_m``, map frame, metres.
+        row: the same for y.
+        tile_m: edge, metres.
+    """
+
+    column: int
+    row: int
+    tile_m: float
+
+    def within(self, margin_m: float, positions: NDArray[np.float64]) -> NDArray[np.bool_]:
+        """Return whether each position is in the square or at most a margin beside it (n,).
+
+        Args:
+            margin_m: margin on all four sides, metres.
+            positions: metres, map frame (n, 2) or (n, 3).
+        """
+        low = np.array([self.column, self.row]) * self.tile_m - margin_m
+        high = np.array([self.column + 1, self.row + 1]) * self.tile_m + margin_m
+        xy = positions[:, :2]
+        return np.asarray(((xy >= low) & (xy < high)).all(axis=1))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TilePart:
+    """The part of a survey that becomes a tile. Its K scans are all kept scans within ``SCANS_MARGIN_M`` of the square.
+
+    Attributes:
+        square: the square of the tile.
+        plan: places of the tile, by the index of the scan in the part.
+        order: index of each scan among all kept scans (K,).
+        travelled_m: travelled distance from the first kept scan of the survey to each scan, metres (K,).
+        survey_scans: number of scans of the survey in the square, kept or not.
+    """
+
+    square: Square
+    plan: PlannedPlaces
+    order: NDArray[np.int64]
+    travelled_m: NDArray[np.float64]
+    survey_scans: int
+
+    def is_in_cloud(self, positions: NDArray[np.float64]) -> NDArray[np.bool_]:
+        """Return whether the cloud of the tile has each point (n,).
+
+        Args:
+            positions: metres, map frame (n, 3).
+        """
+        return self.square.within(TILE_MARGIN_M, positions)
+
+
+def require_tile_edge(tile_m: float) -> None:
+    """Refuse an edge that the format does not allow.
+
+    Args:
+        tile_m: edge of the tiles, metres.
+
+    Raises:
+        DatasetError: the edge is too small, too large or not a number.
+    """
+    if not (math.isfinite(tile_m) and SMALLEST_TILE_M <= tile_m <= LARGEST_TILE_M):
+        raise DatasetError(
+            f"tile_m: {tile_m:g} is not valid; give {SMALLEST_TILE_M:g} to {LARGEST_TILE_M:,.0f} metres", field="tile_m"
+        )
+
+
+def columns_and_rows(positions: NDArray[np.float64], tile_m: float) -> NDArray[np.int64]:
+    """Return the column and the row of the square of each position (n, 2).
+
+    Args:
+        positions: metres, map frame (n, 2) or (n, 3).
+        tile_m: edge of the squares, metres.
+
+    Raises:
+        DatasetError: a position is too far from the origin of the map frame.
+    """
+    xy = positions[:, :2]
+    found = np.floor(xy / tile_m)
+    # The quotient is rounded. The products with the edge decide, as in the format.
+    found -= xy < found * tile_m
+    found += xy >= (found + 1) * tile_m
+    if len(found) and np.abs(found).max() >= MOST_TILES:
+        farthest = int(np.abs(found).max(axis=1).argmax())
+        raise DatasetError(
+            f"survey/poses.txt: {np.round(xy[farthest]).tolist()} m is more than {MOST_TILES:,} tiles from the origin of the map frame; "
+            "subtract an offset from all poses, or give a larger --tile-m",
+            field="poses",
+        )
+    return np.asarray(found.astype(np.int64))
+
+
+def tile_parts(
+    poses: NDArray[np.float64], kept: NDArray[np.int64], *, tile_m: float, between_m: float
+) -> Iterator[TilePart]:
+    """Yield the tiles of a survey that have a place, by column and row.
+
+    Args:
+        poses: given T_map_lidar of all scans of the survey (n, 4, 4).
+        kept: indices of the kept scans, ascending (P,).
+        tile_m: edge of the tiles, metres.
+        between_m: largest distance between two places, metres; 0 puts none between scans.
+
+    Raises:
+        DatasetError: a pose is too far from the origin of the map frame.
+    """
+    T = poses[kept]
+    xy, travelled = T[:, :2, 3], travelled_m(T)
+    of_scan = columns_and_rows(xy, tile_m)
+    scans_in = _grouped(of_scan)
+    later, share = _on_way(T, between_m)
+    of_way = columns_and_rows((1 - share)[:, None] * xy[later - 1] + share[:, None] * xy[later], tile_m)
+    ways_in = _grouped(of_way)
+    given_in = {square: len(found) for square, found in _grouped(columns_and_rows(poses[:, :3, 3], tile_m)).items()}
+    around = range(-math.ceil(SCANS_MARGIN_M / tile_m), math.ceil(SCANS_MARGIN_M / tile_m) + 1)
+    none = np.zeros(0, np.int64)
+    for column, row in sorted(scans_in.keys() | ways_in.keys()):
+        square = Square(column, row, tile_m)
+        near = np.sort(np.concatenate([scans_in.get((column + x, row + y), none) for x in around for y in around]))
+        order = near[square.within(SCANS_MARGIN_M, xy[near])]
+        on_way: dict[int, tuple[float, ...]] = {}
+        for way in ways_in.get((column, row), none):
+            k = int(np.searchsorted(order, later[way]))
+            on_way[k] = (*on_way.get(k, ()), float(share[way]))
+        at_scan = (of_scan[order] == (column, row)).all(axis=1)
+        yield TilePart(square, PlannedPlaces(at_scan, on_way), order, travelled[order], given_in.get((column, row), 0))
+
+
+def _grouped(squares: NDArray[np.int64]) -> dict[tuple[int, int], NDArray[np.int64]]:
+    """Return the rows of each square, ascending, by column and row."""
+    if not len(squares):
+        return {}
+    found, of = np.unique(squares, axis=0, return_inverse=True)
+    by_square = np.argsort(of.ravel(), kind="stable")
+    ends = np.cumsum(np.bincount(of.ravel()))[:-1]
+    parts = np.split(by_square, ends)
+    return {(int(column), int(row)): part for (column, row), part in zip(found, parts, strict=True)}
+
+
+def _on_way(T: NDArray[np.float64], between_m: float) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """Return the places between kept scans: index of the later scan (W,) and share of the way (W,), in their order."""
+    plan = PlannedPlaces.of(T, between_m).on_way
+    later = np.array([k for k, shares in plan.items() for _ in shares], np.int64)
+    return later, np.array([share for shares in plan.values() for share in shares], np.float64)
