@@ -31,6 +31,7 @@ EXTRA_OF_PACKAGE = {
     "small_gicp": "mapping",
     "carla": "carla",
     "cyclonedds": "ros2",
+    "obstore": "store",
     "rerun": "view",
     "foxglove": "view",
 }

@@ -1,6 +1,7 @@
 """The objects below a URL, through ``obstore``. Errors name the URL of the object and the remedy, and no credential."""
 
 import hashlib
+import os
 import re
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -28,6 +29,8 @@ _RETRIES = 6
 _RETRY_FOR, _FIRST_PAUSE, _LONGEST_PAUSE = timedelta(seconds=30), timedelta(milliseconds=100), timedelta(seconds=5)
 #: A whole object may take long, but the connection and each piece may not.
 _CLIENT = {"connect_timeout": "5s", "read_timeout": "30s", "timeout": "6h"}
+#: Variable of each scheme that allows an endpoint without TLS, and what obstore tells otherwise.
+_ALLOW_HTTP = {"s3": "AWS_ALLOW_HTTP", "gs": "GOOGLE_ALLOW_HTTP", "az": "AZURE_ALLOW_HTTP"}
 _NO_HTTP = "builder error"
 #: Query of an address in an error. The signature of Azure is in there.
 _QUERY = re.compile(r"\?\S*")
@@ -70,6 +73,10 @@ def checked_url(text: str) -> str:
     if parts.scheme != "file" and not parts.netloc:
         raise _wrong_url(parts.scheme, "names no bucket; write s3://BUCKET/PATH")
     return text.rstrip("/")
+
+
+def _scheme_of(url: str) -> str:
+    return url.partition(":")[0]
 
 
 def _wrong_url(scheme: str, what: str) -> BundleError:
@@ -120,7 +127,10 @@ class Remote:
                 "retry_timeout": _RETRY_FOR,
                 "backoff": {"init_backoff": _FIRST_PAUSE, "max_backoff": _LONGEST_PAUSE, "base": 2},
             }
-            return cls(url, from_url(url, client_options=_CLIENT, retry_config=retry))  # type: ignore[call-overload]
+            # obstore reads this variable itself, but not beside other options of the client.
+            allow_http = os.environ.get(_ALLOW_HTTP[_scheme_of(url)], "").lower() in ("1", "true")
+            client = {**_CLIENT, "allow_http": allow_http}
+            return cls(url, from_url(url, client_options=client, retry_config=retry))  # type: ignore[call-overload]
         except (BaseError, ValueError, OSError) as error:
             raise _failed(url, "cannot be opened", error) from error
 
@@ -241,8 +251,8 @@ def _failed(url: str, what: str, error: Exception) -> BundleError:
     if (status := _STATUS.search(line)) is not None:
         code = _CODE.search(whole)
         line = f"status {status[1].strip()}" + (f", {code[1]}" if code else "")
-    if _NO_HTTP in line:
-        remedy = "for an endpoint without TLS set AWS_ALLOW_HTTP=true"
+    if _NO_HTTP in line and _scheme_of(url) in _ALLOW_HTTP:
+        remedy = f"for an endpoint without TLS set {_ALLOW_HTTP[_scheme_of(url)]}=true"
     else:
         remedy = "check the URL, the endpoint, the network and the credentials (docs/operate.md)"
     return BundleError(f"{url} {what} ({line[:300]}); {remedy}", field=url.rpartition("/")[2])
