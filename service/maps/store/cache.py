@@ -1,7 +1,7 @@
 """A folder of tiles that several processes share. It is bounded: the least recently used tiles make room for new ones.
 
-``CACHE/KEY/tiles/VERSION`` is the folder of a tile, and ``CACHE/KEY/VERSION`` the folder of a version of a map. Such a folder is whole or
-missing. A process fills ``.NAME.partial`` beside it, whose lock it holds, and renames it. Whoever wants the same folder waits for the lock.
+``CACHE/KEY/tiles/VERSION-HASH`` is the folder of a tile, and ``CACHE/KEY/VERSION`` the folder of a version of a map. Such a folder is
+whole or missing. A process fills ``.NAME.partial`` beside it, whose lock it holds, and renames it. Whoever wants the same folder waits for the lock.
 Its system releases the lock of a killed process, so the next process takes over.
 
 A file stays readable for a process that has it open or mapped, also after its folder is deleted. So a tile in use may be deleted.
@@ -22,6 +22,22 @@ from service.maps.manifest import TILES_FOLDER
 
 _PARTIAL, _DELETED = ".partial", ".deleted"
 _LOCK = ".lock"
+
+
+def default_folder() -> Path:
+    """Return the usual folder of the cache: ``streetfix/tiles`` in ``$XDG_CACHE_HOME`` or ``~/.cache``.
+
+    Raises:
+        BundleError: the user has no home folder.
+    """
+    try:
+        base = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+    except RuntimeError as error:
+        raise BundleError(
+            "maps in object storage need a cache, and the user of the service has no home folder; set STREETFIX_TILE_CACHE",
+            field="tile_cache",
+        ) from error
+    return base / "streetfix" / "tiles"
 
 
 @dataclass(frozen=True, slots=True)
@@ -102,7 +118,6 @@ class TileCache:
             shutil.rmtree(doomed, ignore_errors=True)
 
     def _make_room(self, needed: int) -> None:
-        # Each tile once: ``tiles`` of a version is a link, and two levels down.
         tiles = [_Kept.of(each) for each in self.folder.glob(f"*/{TILES_FOLDER}/*") if not each.name.endswith(_DELETED)]
         free = self.most_bytes - sum(each.size for each in tiles)
         for oldest in sorted(tiles, key=lambda each: each.used):
@@ -181,10 +196,7 @@ def make_once(target: Path, fill: Callable[[Path], None]) -> None:
                 continue
             try:
                 for left in partial.iterdir():  # by a killed process
-                    if left.is_dir() and not left.is_symlink():
-                        shutil.rmtree(left)
-                    else:
-                        left.unlink()
+                    shutil.rmtree(left) if left.is_dir() else left.unlink()
                 fill(partial)
                 sync_tree(partial)  # otherwise a crash of the machine could leave a whole folder of damaged files
                 partial.rename(target)

@@ -97,9 +97,32 @@ def tile_manifest(remote: Remote, tile: Tile) -> tuple[Manifest, bytes]:
     name = f"{tile.folder}/{FILE}"
     found = remote.read(name)
     data = b"" if found is None else found[0]
+    if not is_manifest_of(tile, data):
+        data = remote.read_if_there(other_manifest(tile)) or data
     where = f"{remote.url}/{name}"
     require_tile_manifest(data, tile, where)
     return parsed_manifest(data, where), data
+
+
+def other_manifest(tile: Tile) -> str:
+    """Return where a store has the manifest of a tile whose folder has another manifest already.
+
+    The same content may have been built twice. The two manifests differ in their dates, and two versions of the map refer to them.
+
+    Args:
+        tile: of the map's manifest.
+    """
+    return f"{tile.folder}/manifest-{tile.manifest_sha256[:16]}.json"
+
+
+def is_manifest_of(tile: Tile, data: bytes | None) -> bool:
+    """Return whether bytes are the manifest of a tile.
+
+    Args:
+        tile: of the map's manifest.
+        data: the bytes; None if there are none.
+    """
+    return data is not None and hashlib.sha256(data).hexdigest() == tile.manifest_sha256
 
 
 def require_tile_manifest(data: bytes, tile: Tile, where: str) -> None:
@@ -113,7 +136,7 @@ def require_tile_manifest(data: bytes, tile: Tile, where: str) -> None:
     Raises:
         BundleError: they are not.
     """
-    if hashlib.sha256(data).hexdigest() != tile.manifest_sha256:
+    if not is_manifest_of(tile, data):
         raise BundleError(
             f"{where}: the hash does not match the manifest of the map; copy or push the map again", field=FILE
         )
@@ -138,7 +161,7 @@ def shared_files(manifest: Manifest, where: str, *, leave_out: Collection[str] =
     return {name: entry for name, entry in manifest.files.items() if name not in leave_out}
 
 
-def shared_prefix(remote: Remote, manifest: Manifest, data: bytes) -> str:
+def shared_prefix(remote: Remote, manifest: Manifest) -> str:
     """Return where the shared files of a map are, as ``fetch_files`` needs it.
 
     ``map push`` stores them in a folder of this version. A folder that another tool copied has them at the top.
@@ -146,10 +169,9 @@ def shared_prefix(remote: Remote, manifest: Manifest, data: bytes) -> str:
     Args:
         remote: the store of the map.
         manifest: of the map.
-        data: bytes of the manifest.
 
     Raises:
         BundleError: the store cannot be read.
     """
     folder = f"{VERSIONS_FOLDER}/{manifest.version}/"
-    return folder if remote.read_if_there(folder + FILE) == data else ""
+    return "" if remote.read_if_there(folder + FILE) is None else folder

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, BinaryIO
 from urllib.parse import urlsplit
 
 from service.errors import BundleError, extra_missing
-from service.maps.manifest import FileEntry
+from service.maps.manifest import FILE, FileEntry
 
 if TYPE_CHECKING:
     from obstore.store import ObjectStore
@@ -192,7 +192,10 @@ class Remote:
             OSError: the file cannot be written.
         """
         with self._telling(name):
-            found = self._store.get(name)
+            try:
+                found = self._store.get(name)
+            except FileNotFoundError as error:
+                raise self._damaged(name, "is missing in the store") from error
             chunks = iter(found.stream(min_chunk_size=_CHUNK))
         if (size := found.meta["size"]) != entry.size:
             raise self._damaged(name, f"{size} bytes instead of {entry.size}")
@@ -227,7 +230,12 @@ class Remote:
             self._store.put(name, content, max_concurrency=_PARTS)
 
     def _damaged(self, name: str, what: str) -> BundleError:
-        return BundleError(f"{self.url}/{name}: {what}; push the map again (streetfix map push)", field=name)
+        # Only without this manifest does ``push`` store the files again.
+        beside = f"{name.rpartition('/cloud/')[0] or name.rpartition('/')[0]}/{FILE}".lstrip("/")
+        return BundleError(
+            f"{self.url}/{name}: {what}; delete {beside} in the store and push the map again (streetfix map push)",
+            field=name,
+        )
 
     @contextmanager
     def _telling(self, name: str, what: str = "cannot be read") -> Iterator[None]:

@@ -21,9 +21,9 @@ _UNUSUAL = re.compile(r"[^A-Za-z0-9._-]+")
 class StoredMap:
     """A map under a URL, and its folder in the cache. Threads and processes may share the cache.
 
-    ``folder`` has a folder for each version of the map. It looks like the folder of a map that was copied: ``manifest.json``, the shared
-    files, and ``tiles``. But ``tiles`` has only the tiles that ``StoreTiles`` has fetched. All versions share them. A map without tiles is
-    fetched whole. Files that the service does not read are left out.
+    ``folder`` has a folder for each version of the map, with ``manifest.json`` and the shared files. Its folder ``tiles`` has the tiles
+    that ``StoreTiles`` has fetched. All versions share them. A map without tiles is fetched whole. Files that the service does not read are left
+    out.
 
     Args:
         url: such as ``s3://bucket/maps/town``.
@@ -70,6 +70,10 @@ class StoredMap:
                 newer.replace(target / FILE)
         self._etag, self._version = etag, manifest.version
 
+    def versions(self) -> list[Path]:
+        """Return the folders of the versions in the cache."""
+        return sorted(each.parent for each in self.folder.glob(f"[!.]*/{FILE}"))
+
     def tiles(self, version: Path) -> "StoreTiles":
         """Return the source of the tiles of a version.
 
@@ -86,8 +90,8 @@ class StoredMap:
         """
         if self._version is None:
             return
-        for each in self.folder.iterdir():
-            if not (each.name.startswith(".") or each.name in {*keep, self._version, TILES_FOLDER}):
+        for each in self.versions():
+            if each.name not in {*keep, self._version}:
                 self._cache.delete(each)
 
     def _opened(self) -> Remote:
@@ -98,10 +102,7 @@ class StoredMap:
     def _fetch_version(self, manifest: Manifest, data: bytes, into: Path) -> None:
         remote = self._opened()
         files = shared_files(manifest, f"{self.url}/{FILE}", leave_out=NOT_SERVED)
-        fetch_files(remote, shared_prefix(remote, manifest, data), files, into)
-        if manifest.tiles:
-            (self.folder / TILES_FOLDER).mkdir(exist_ok=True)
-            (into / TILES_FOLDER).symlink_to(Path("..") / TILES_FOLDER, target_is_directory=True)
+        fetch_files(remote, shared_prefix(remote, manifest), files, into)
         (into / FILE).write_bytes(data)
 
 
@@ -121,9 +122,8 @@ class StoreTiles:
     def folder(self, tile: Tile) -> Path:
         """Return the folder with the bundle of a tile; fetch it unless the cache has it.
 
-        The bundle lacks the files that the service does not read. Its files were compared with its manifest, so
-        ``MapBundle.open(..., verify=False)`` is enough. The bound of the cache may delete the folder later. Open files stay readable. If
-        the folder is gone before it was opened, ask again.
+        The bundle lacks the files that the service does not read. The bound of the cache may delete the folder later. Open files stay
+        readable. If the folder is gone before it was opened, ask again.
 
         Args:
             tile: of the map's manifest.
@@ -131,7 +131,8 @@ class StoreTiles:
         Raises:
             BundleError: the store cannot be read, a file is damaged, or the cache cannot be used.
         """
-        folder = self._version.parent / tile.folder
+        # A tile that was built again has the same version, but another date in its manifest.
+        folder = self._version.parent / TILES_FOLDER / f"{tile.version}-{tile.manifest_sha256[:16]}"
         if not is_used_now(folder):
             self._cache.once(folder, partial(self._fetch, tile))
         return folder

@@ -10,6 +10,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from datetime import UTC, datetime
+from functools import partial
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 
@@ -18,7 +19,7 @@ import pytest
 from benchmarks.scale.s3_server import BUCKET, CREDENTIALS, s3_server
 from service.errors import BundleError, ExtraMissingError
 from service.maps.content import NOT_SERVED, BundleContent
-from service.maps.manifest import Counts, FileEntry, Manifest, Tile, read_manifest
+from service.maps.manifest import Manifest, Tile, read_manifest
 from service.maps.reader import MapBundle
 from service.maps.store import cache as cache_module
 from service.maps.store import fetch, remote, transfer
@@ -26,52 +27,20 @@ from service.maps.store.cache import TileCache
 from service.maps.store.remote import Remote, checked_url
 from service.maps.store.stored_map import StoredMap, StoreTiles
 from service.maps.store.transfer import pull, push
-from service.maps.writer import sha256_of, write_bundle
+from service.maps.tiled_writer import write_tiled
+from service.maps.tiles import TiledMap, TileSource
+from service.maps.writer import write_bundle
 
 Content = Callable[..., BundleContent]
-SHARED = ("encoder.onnx", "streets.geojson", "calibration.json")
 
 
-def write_tiled_map(out: Path, content_of: Content, encoder: bytes, *, tiles: int = 3, name: str = "town") -> Manifest:
-    """Tiles that differ in their descriptors. Each is 100 m further east, as far as its manifest says."""
-    made = []
+def write_tiled_map(out: Path, content_of: Content, encoder: bytes, *, tiles: int = 3) -> Manifest:
+    """Tiles that differ in their descriptors."""
+    squares = {}
     for number in range(tiles):
-        folder = out / "tiles" / f"writing-{number}"
-        content = content_of(seed=number + 1, encoder=encoder, name=name, preview_webp=b"a picture")
-        manifest = write_bundle(folder, content)
-        folder.rename(folder.parent / manifest.version)
-        made.append(manifest)
-    first = made[0]
-    entries = []
-    for number, each in enumerate(made):
-        folder = out / "tiles" / each.version
-        size = sum(file.stat().st_size for file in folder.rglob("*") if file.is_file())
-        entries.append(
-            Tile(
-                column=number,
-                row=0,
-                version=each.version,
-                manifest_sha256=sha256_of(folder / "manifest.json"),
-                size=size,
-                counts=each.counts,
-            )
-        )
-    for name_ in SHARED:
-        shutil.copyfile(out / "tiles" / first.version / name_, out / name_)
-    total = {part: sum(getattr(each.counts, part) for each in made) for part in ("places", "views", "cloud_points")}
-    whole = Manifest.model_validate(
-        {
-            **first.model_dump(),
-            "version": "0" * 16,
-            "made_at": datetime.now(UTC),
-            "counts": Counts(**first.counts.model_dump() | total),
-            "files": {name_: FileEntry(sha256=sha256_of(out / name_), size=(out / name_).stat().st_size) for name_ in SHARED},
-            "tile_m": 100.0,
-            "tiles": tuple(entries),
-        }
-    ).stamped()
-    (out / "manifest.json").write_bytes(whole.to_bytes())
-    return read_manifest(out)
+        squares[number, 0] = out.parent / f"{out.name}-tiles" / str(number)
+        write_bundle(squares[number, 0], content_of(seed=number + 1, encoder=encoder, preview_webp=b"a picture"))
+    return write_tiled(out, squares, 100.0, name="town")
 
 
 @pytest.fixture(scope="module")
@@ -125,6 +94,10 @@ def same_files(one: Path, other: Path) -> bool:
     return files[0] == files[1] and all((one / each).read_bytes() == (other / each).read_bytes() for each in files[0])
 
 
+def versions_in(tiles: Path) -> set[str]:
+    return {each.name.partition("-")[0] for each in tiles.iterdir()}
+
+
 def left_over(folder: Path) -> list[Path]:
     return [each for each in folder.rglob("*") if each.name.endswith((".partial", ".deleted"))]
 
@@ -136,7 +109,9 @@ class TestPushAndPull:
         got = pull(url, tmp_path / "back")
         assert same_files(town, tmp_path / "back")
         assert got.tiles == 3
-        assert got.size == sum(each["size"] for each in _all_entries(town))
+        manifest = read_manifest(town)
+        shared = sum(entry.size for entry in manifest.files.values())
+        assert got.size == sent.size == shared + sum(tile.size for tile in manifest.tiles)
 
     def test_a_map_of_one_bundle_comes_back_as_it_was(self, bundle_path: Path, url: str, tmp_path: Path) -> None:
         push(bundle_path, url)
@@ -161,6 +136,36 @@ class TestPushAndPull:
         assert store.read_if_there("manifest.json") == larger.to_bytes()
         old = read_manifest(town)
         assert store.read_if_there(f"versions/{old.version}/manifest.json") == old.to_bytes()
+
+    def test_a_tile_that_was_built_again_damages_no_earlier_version(
+        self,
+        town: Path,
+        url: str,
+        content_of: Content,
+        encoder_of: Callable[..., bytes],
+        tmp_path: Path,
+        cache: TileCache,
+    ) -> None:
+        """Its content is the same, and so is its folder. Its manifest has another date."""
+        push(town, url)
+        _, old, before, old_tiles = stored(url, cache)
+        again = write_tiled_map(tmp_path / "again", content_of, encoder_of())
+        assert [each.version for each in again.tiles] == [each.version for each in before.tiles]
+        assert again.version != before.version
+        sent = push(tmp_path / "again", url)
+        assert sent.tiles == 3
+        assert sent.size < sum(each.size for each in again.tiles) / 2
+        assert push(tmp_path / "again", url).size == 0
+        pull(url, tmp_path / "back")
+        assert same_files(tmp_path / "again", tmp_path / "back")
+        found = StoredMap(url, cache)
+        found.refresh()
+        for version, tiles in (
+            (old, old_tiles),
+            (found.folder / again.version, found.tiles(found.folder / again.version)),
+        ):
+            for number in range(3):
+                TiledMap.open(version, source=tiles).tiles.get(number)
 
     def test_progress_ends_at_the_size_of_the_map(
         self, town: Path, file_url: str, monkeypatch: pytest.MonkeyPatch
@@ -207,9 +212,7 @@ class TestPushAndPull:
         pull(url, tmp_path / "back")
         assert same_files(town, tmp_path / "back")
 
-    def test_an_interrupted_pull_continues(
-        self, town: Path, file_url: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-    ) -> None:
+    def test_an_interrupted_pull_continues(self, town: Path, file_url: str, tmp_path: Path) -> None:
         push(town, file_url)
         last = read_manifest(town).tiles[-1]
         broken = store_of(file_url) / last.folder / "places.npy"
@@ -233,7 +236,10 @@ class TestPushAndPull:
     def test_two_pulls_to_one_folder_do_not_mix(self, town: Path, file_url: str, tmp_path: Path) -> None:
         push(town, file_url)
         (tmp_path / ".back.pulling").mkdir()
-        with cache_module._locked(tmp_path / ".back.pulling"), pytest.raises(BundleError, match="another process pulls"):
+        with (
+            cache_module._locked(tmp_path / ".back.pulling"),
+            pytest.raises(BundleError, match="another process pulls"),
+        ):
             pull(file_url, tmp_path / "back")
 
     def test_a_damaged_map_is_not_pushed(self, town: Path, file_url: str, tmp_path: Path) -> None:
@@ -251,26 +257,45 @@ class TestPushAndPull:
         MapBundle.open(tiles.folder(manifest.tiles[0]))
 
 
-def _all_entries(town: Path) -> list[dict[str, int]]:
-    manifests = [read_manifest(town), *(read_manifest(town / tile.folder) for tile in read_manifest(town).tiles)]
-    return [entry.model_dump() for manifest in manifests for entry in manifest.files.values()]
-
-
 class TestTiles:
     def test_a_tile_is_fetched_when_it_is_needed(self, town: Path, url: str, cache: TileCache) -> None:
         push(town, url)
         found, version, manifest, tiles = stored(url, cache)
         assert manifest == read_manifest(town)
-        assert list((version / "tiles").iterdir()) == []
+        assert not (found.folder / "tiles").exists()
         folder = tiles.folder(manifest.tiles[1])
-        assert folder.samefile(version / manifest.tiles[1].folder)
-        assert [each.name for each in (found.folder / "tiles").iterdir()] == [manifest.tiles[1].version]
+        assert list((found.folder / "tiles").iterdir()) == [folder]
+        assert not (version / "tiles").exists()
         opened = MapBundle.open(folder)
         assert opened.manifest == read_manifest(town / manifest.tiles[1].folder)
         assert opened.cloud is not None
 
+    def test_a_tiled_map_opens_its_tiles_from_the_store(self, town: Path, url: str, cache: TileCache) -> None:
+        push(town, url)
+        _, version, manifest, tiles = stored(url, cache)
+        assert isinstance(tiles, TileSource)
+        opened, expected = TiledMap.open(version, source=tiles), TiledMap.open(town)
+        assert opened.tiles.get(2).manifest == expected.tiles.get(2).manifest
+        assert list((version.parent / "tiles").iterdir()) == [tiles.folder(manifest.tiles[2])]
+
+    def test_a_tile_that_is_deleted_before_it_was_opened_is_fetched_again(
+        self, town: Path, file_url: str, cache: TileCache, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        push(town, file_url)
+        _, version, _, tiles = stored(file_url, cache)
+        folder, times = tiles.folder, iter([True, False])
+
+        def deleted(tile: Tile) -> Path:
+            found = folder(tile)
+            if next(times):
+                cache.delete(found)
+            return found
+
+        monkeypatch.setattr(tiles, "folder", deleted)
+        TiledMap.open(version, source=tiles).tiles.get(0)
+
     def test_files_that_the_service_does_not_read_are_left_out(
-        self, bundle_path: Path, town: Path, file_url: str, cache: TileCache
+        self, town: Path, file_url: str, cache: TileCache
     ) -> None:
         push(town, file_url)
         _, _, manifest, tiles = stored(file_url, cache)
@@ -331,7 +356,7 @@ class TestTiles:
         with pytest.raises(BundleError, match=r"not the bundle of tile 0 0"):
             tiles.folder(forged)
 
-    @pytest.mark.parametrize("name", ["../../outside", "/tmp/outside", "tiles/0123456789abcdef/places.npy"])
+    @pytest.mark.parametrize("name", ["../../outside", "/srv/outside", "tiles/0123456789abcdef/places.npy"])
     def test_a_manifest_cannot_write_elsewhere(
         self, town: Path, file_url: str, cache: TileCache, tmp_path: Path, name: str
     ) -> None:
@@ -368,7 +393,7 @@ class TestBound:
         roomy = TileCache(tmp_path / "roomy", 10**9)
         found, _, manifest, source = stored(file_url, roomy)
         source.folder(manifest.tiles[0])
-        size = cache_module._Kept.of(found.folder / manifest.tiles[0].folder).size
+        size = cache_module._Kept.of(source.folder(manifest.tiles[0])).size
         found, _, _, source = stored(file_url, TileCache(tmp_path / "cache", int(size * tiles)))
         return source, manifest, found.folder / "tiles"
 
@@ -377,15 +402,15 @@ class TestBound:
         for tile in (0, 1, 0, 2):  # 0 is used again, so 1 goes
             tiles.folder(manifest.tiles[tile])
             time.sleep(0.02)
-        assert {each.name for each in folder.iterdir()} == {manifest.tiles[tile].version for tile in (0, 2)}
+        assert versions_in(folder) == {manifest.tiles[tile].version for tile in (0, 2)}
         tiles.folder(manifest.tiles[1])
-        assert {each.name for each in folder.iterdir()} == {manifest.tiles[tile].version for tile in (1, 2)}
+        assert versions_in(folder) == {manifest.tiles[tile].version for tile in (1, 2)}
 
     def test_a_deleted_tile_stays_readable_where_it_is_open(self, town: Path, file_url: str, tmp_path: Path) -> None:
         tiles, manifest, folder = self.bounded(town, file_url, tmp_path, 1.5)
         opened = MapBundle.open(tiles.folder(manifest.tiles[0]))
         tiles.folder(manifest.tiles[1])
-        assert not (folder / manifest.tiles[0].version).exists()
+        assert versions_in(folder) == {manifest.tiles[1].version}
         expected = MapBundle.open(town / manifest.tiles[0].folder)
         assert (opened.T_map_place == expected.T_map_place).all()
         assert opened.cloud is not None
@@ -407,11 +432,15 @@ class TestBound:
         found, _, manifest, tiles = stored(file_url, cache)
         usage = shutil.disk_usage(cache.folder)
         monkeypatch.setattr(shutil, "disk_usage", lambda _: usage._replace(free=1000))
-        with pytest.raises(BundleError, match=r"cache: the disk is full; free disk space, lower STREETFIX_TILE_CACHE_BYTES"):
+        with pytest.raises(
+            BundleError, match=r"cache: the disk is full; free disk space, lower STREETFIX_TILE_CACHE_BYTES"
+        ):
             tiles.folder(manifest.tiles[0])
         assert list((found.folder / "tiles").iterdir()) == []
 
-    def test_what_a_killed_process_left_is_deleted_at_the_start(self, town: Path, file_url: str, cache: TileCache) -> None:
+    def test_what_a_killed_process_left_is_deleted_at_the_start(
+        self, town: Path, file_url: str, cache: TileCache
+    ) -> None:
         push(town, file_url)
         found, version, manifest, tiles = stored(file_url, cache)
         whole = tiles.folder(manifest.tiles[0])
@@ -424,7 +453,9 @@ class TestBound:
         assert {each.name for each in (found.folder / "tiles").iterdir()} == {whole.name, ".fedcba9876543210.partial"}
         assert {each.name for each in found.folder.iterdir()} == {version.name, "tiles"}
 
-    def test_a_cache_that_nobody_may_write_is_an_error_that_names_the_setting(self, town: Path, file_url: str, tmp_path: Path) -> None:
+    def test_a_cache_that_nobody_may_write_is_an_error_that_names_the_setting(
+        self, town: Path, file_url: str, tmp_path: Path
+    ) -> None:
         push(town, file_url)
         (tmp_path / "cache").write_text("a file")
         with pytest.raises(BundleError, match="STREETFIX_TILE_CACHE"):
@@ -441,7 +472,7 @@ def _fetch_in_process(url: str, folder: Path, number: int, barrier: object, told
         time.sleep(0.01)
         save(self, name, *arguments, **named)  # type: ignore[arg-type]
 
-    Remote.save = counted  # type: ignore[method-assign,assignment]
+    Remote.save = counted  # type: ignore[method-assign]
     found = StoredMap(url, TileCache(folder, 10**9))
     barrier.wait(30)  # type: ignore[attr-defined]
     found.refresh()
@@ -457,7 +488,8 @@ def test_two_processes_fetch_each_file_once(town: Path, url: str, tmp_path: Path
     spawn = multiprocessing.get_context("spawn")
     barrier, told = spawn.Barrier(2), spawn.Queue()
     processes = [
-        spawn.Process(target=_fetch_in_process, args=(url, tmp_path / "cache", number, barrier, told)) for number in range(2)
+        spawn.Process(target=_fetch_in_process, args=(url, tmp_path / "cache", number, barrier, told))
+        for number in range(2)
     ]
     for each in processes:
         each.start()
@@ -469,7 +501,9 @@ def test_two_processes_fetch_each_file_once(town: Path, url: str, tmp_path: Path
     assert left_over(tmp_path / "cache") == []
 
 
-def test_threads_fetch_a_tile_once(town: Path, file_url: str, cache: TileCache, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_threads_fetch_a_tile_once(
+    town: Path, file_url: str, cache: TileCache, monkeypatch: pytest.MonkeyPatch
+) -> None:
     push(town, file_url)
     _, _, manifest, tiles = stored(file_url, cache)
     names: list[str] = []
@@ -500,7 +534,7 @@ def test_who_waited_for_a_failed_fetch_tries_itself(town: Path, file_url: str, c
 
     def first() -> None:
         try:
-            cache.once(found.folder / tile.folder, fails)
+            cache.once(found.folder / "tiles" / f"{tile.version}-{tile.manifest_sha256[:16]}", fails)
         except BundleError as error:
             errors.append(error.message)
 
@@ -513,7 +547,7 @@ def test_who_waited_for_a_failed_fetch_tries_itself(town: Path, file_url: str, c
     one.join(30)
     other.join(30)
     assert errors == ["the first fails"]
-    MapBundle.open(found.folder / tile.folder)
+    MapBundle.open(tiles.folder(tile))
 
 
 class TestVersions:
@@ -543,14 +577,16 @@ class TestVersions:
         found.refresh()
         new = found.folder / changed.version
         assert read_manifest(new) == changed
-        assert (new / changed.tiles[0].folder).samefile(tile)
+        assert found.tiles(new).folder(changed.tiles[0]) == tile
         assert old.exists()
         found.forget([])
         assert not old.exists()
         assert new.exists()
         assert tile.exists()
 
-    def test_a_version_that_was_built_again_has_its_new_date(self, town: Path, file_url: str, cache: TileCache, tmp_path: Path) -> None:
+    def test_a_version_that_was_built_again_has_its_new_date(
+        self, town: Path, file_url: str, cache: TileCache, tmp_path: Path
+    ) -> None:
         push(town, file_url)
         found, version, manifest, _ = stored(file_url, cache)
         later = manifest.model_copy(update={"made_at": datetime.now(UTC)})
@@ -569,7 +605,9 @@ class TestVersions:
 class TestErrors:
     def test_a_missing_map_is_an_error_that_names_it(self, town: Path, url: str, cache: TileCache) -> None:
         push(town, url)
-        with pytest.raises(BundleError, match=f"{url}/none(/manifest.json is missing in the store| cannot be opened .*); check the URL"):
+        with pytest.raises(
+            BundleError, match=f"{url}/none(/manifest.json is missing in the store| cannot be opened .*); check the URL"
+        ):
             StoredMap(f"{url}/none", cache).refresh()
 
     def test_a_missing_bucket_is_told_when_a_map_is_pushed(
@@ -592,7 +630,8 @@ class TestErrors:
             StoredMap("s3://bucket/town", cache).refresh()
         assert "s3://bucket/town/manifest.json cannot be read" in told.value.message
         assert "error sending request" in told.value.message
-        assert not any(secret in told.value.message for secret in CREDENTIALS.values() if secret != "us-east-1")
+        assert CREDENTIALS["AWS_ACCESS_KEY_ID"] not in told.value.message
+        assert CREDENTIALS["AWS_SECRET_ACCESS_KEY"] not in told.value.message
 
     def test_an_endpoint_without_tls_needs_a_variable(self, cache: TileCache, monkeypatch: pytest.MonkeyPatch) -> None:
         for key, value in CREDENTIALS.items():
@@ -620,14 +659,18 @@ class TestErrors:
 
     def test_a_signature_in_an_address_is_not_told(self) -> None:
         error = remote._failed(
-            "az://maps/town", "cannot be read", ValueError("GET https://a.blob.core.windows.net/x?sig=SECRET&sv=1 failed\nmore")
+            "az://maps/town",
+            "cannot be read",
+            ValueError("GET https://a.blob.core.windows.net/x?sig=SECRET&sv=1 failed\nmore"),
         )
         assert "SECRET" not in error.message
         assert "https://a.blob.core.windows.net/x failed" in error.message
 
     def test_the_answer_of_a_server_is_told_by_its_code(self) -> None:
         body = "<Error><Code>SignatureDoesNotMatch</Code><AWSAccessKeyId>AKIA</AWSAccessKeyId></Error>"
-        error = remote._failed("s3://b/t", "cannot be read", ValueError(f"Server returned status code: 403 Forbidden: {body}"))
+        error = remote._failed(
+            "s3://b/t", "cannot be read", ValueError(f"Server returned status code: 403 Forbidden: {body}")
+        )
         assert "(status 403 Forbidden, SignatureDoesNotMatch)" in error.message
         assert "AKIA" not in error.message
 
@@ -718,6 +761,6 @@ def test_a_failure_stops_the_other_transfers() -> None:
 
     started = time.monotonic()
     with pytest.raises(BundleError, match="the first"):
-        fetch.concurrently([lambda go_on, number=number: work(number, go_on) for number in range(100)])
+        fetch.concurrently(partial(work, number) for number in range(100))
     assert len(begun) < 100
     assert time.monotonic() - started < 8
