@@ -1,8 +1,8 @@
 """A folder of tiles that several processes share. It is bounded: the least recently used tiles make room for new ones.
 
 ``CACHE/KEY/tiles/VERSION-HASH`` is the folder of a tile, and ``CACHE/KEY/VERSION`` the folder of a version of a map. Such a folder is
-whole or missing. A process fills ``.NAME.partial`` beside it, whose lock it holds, and renames it. Whoever wants the same folder waits for the lock.
-Its system releases the lock of a killed process, so the next process takes over.
+whole or missing. A process fills ``.NAME.partial`` beside it, whose lock it holds, and renames it. Whoever wants the same folder waits
+for the lock. The system releases the lock of a killed process, so the next process takes over.
 
 A file stays readable for a process that has it open or mapped, also after its folder is deleted. So a tile in use may be deleted.
 """

@@ -22,8 +22,8 @@ class StoredMap:
     """A map under a URL, and its folder in the cache. Threads and processes may share the cache.
 
     ``folder`` has a folder for each version of the map, with ``manifest.json`` and the shared files. Its folder ``tiles`` has the tiles
-    that ``StoreTiles`` has fetched. All versions share them. A map without tiles is fetched whole. Files that the service does not read are left
-    out.
+    that ``StoreTiles`` has fetched. All versions share them. A map without tiles is fetched whole. Files that the service does not read
+    are left out.
 
     Args:
         url: such as ``s3://bucket/maps/town``.
