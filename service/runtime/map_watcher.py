@@ -11,9 +11,9 @@ from pathlib import Path
 
 from service.errors import BundleError, StreetfixError
 from service.localization.localizer import Localizer
-from service.maps.manifest import TILES_FOLDER, Manifest, read_manifest
+from service.maps.manifest import TILES_FOLDER, Manifest, Tile, read_manifest
 from service.maps.store.stored_map import StoredMap
-from service.maps.tiles import open_map
+from service.maps.tiles import TileSource, open_map
 from service.runtime.map_registry import MapRegistry, Refused, bundle_paths, twin_error, version_of
 from service.runtime.serving_table import Key, MapVersion
 from service.runtime.wakeup import Wakeup
@@ -28,6 +28,26 @@ _POLL_S = 0.25
 _RETRY_S, _ROUNDS_UNTIL_ANEW = 1.0, 30
 #: Address of a store in a message.
 _ADDRESS = re.compile(r"\b\w+://\S*")
+
+
+#: Stamp that no folder has.
+_NEVER: Stamp = (("", 0, 0),)
+
+
+class _LoggedTiles:
+    """Log why a tile cannot be fetched. The answer to the request does not say so, because the reason has addresses and folders."""
+
+    def __init__(self, tiles: TileSource) -> None:
+        self._tiles = tiles
+        self.has_failed = False
+
+    def folder(self, tile: Tile) -> Path:
+        try:
+            return self._tiles.folder(tile)
+        except StreetfixError as error:
+            self.has_failed = True
+            _log.error("tile_not_fetched tile=%s reason=%s", tile.folder, error.message)
+            raise
 
 
 @dataclass(frozen=True, slots=True)
@@ -200,14 +220,17 @@ class MapWatcher:
 
     def _mount(self, bundle: _Bundle) -> StreetfixError | None:
         """Open, warm up and mount a bundle; return the error if that fails."""
+        source, stamp = None, bundle.stamp
         try:
-            stored = self._stored.get(bundle.path.parent)
-            source = None if stored is None else stored.tiles(bundle.path)
+            if (stored := self._stored.get(bundle.path.parent)) is not None:
+                source = _LoggedTiles(stored.tiles(bundle.path))
             localizer = Localizer.open(open_map(bundle.path, source=source), provider=self._registry.provider)
             self._warm(localizer)
             self._registry.mount(localizer)
         except StreetfixError as error:
-            return self._refuse(bundle.path, bundle.stamp, error)
+            if source is not None and source.has_failed:  # the store may answer again, so the next scan tries again
+                stamp = _NEVER
+            return self._refuse(bundle.path, stamp, error)
         except Exception as error:  # any defect refuses only this bundle; the others are still processed
             _log.exception("map_failed path=%s", bundle.path)
             what = f"{bundle.path}: cannot be opened ({type(error).__name__}); see the log of the service"

@@ -105,6 +105,21 @@ def test_a_store_that_is_gone_stops_no_service(town: Town) -> None:
     assert registry.refused == ()
 
 
+def test_a_tile_that_cannot_be_fetched_is_tried_again_and_logged(town: Town, caplog: pytest.LogCaptureFixture) -> None:
+    town.push()
+    registry, watcher = town.service()
+    watcher.open_first()
+    version = town.push()
+    shutil.move(town.folder / "store" / "town" / "tiles", town.folder / "away")
+    (told,) = watcher.scan()
+    assert "the tile cannot be fetched; the log of the service says why" in told
+    assert all("file://" not in each.reason and str(town.folder) not in each.reason for each in registry.refused)
+    assert f"{town.url}/tiles/" in caplog.text
+    shutil.move(town.folder / "away", town.folder / "store" / "town" / "tiles")
+    assert watcher.scan() == [f"mounted town {version}"]
+    assert registry.refused == ()
+
+
 def test_a_service_starts_from_its_cache_without_the_store(town: Town) -> None:
     version = town.push()
     town.service()[1].open_first()
