@@ -213,14 +213,27 @@ def read_manifest(directory: Path) -> Manifest:
         raise dataset_error(directory) or BundleError(
             f"{directory}: not a map bundle: {FILE} {why}; give the folder that build-map wrote", field=FILE
         ) from error
-    _require_format(path, data)
+    return parsed_manifest(data, str(path))
+
+
+def parsed_manifest(data: bytes, where: str) -> Manifest:
+    """Check the content of a manifest.
+
+    Args:
+        data: content of ``manifest.json``.
+        where: path or URL of the file, for messages.
+
+    Raises:
+        BundleError: the manifest is malformed, of another format version, or inconsistent.
+    """
+    _require_format(where, data)
     try:
         manifest = Manifest.model_validate_json(data)
     except ValidationError as error:
         first = error.errors(include_url=False, include_input=False)[0]
-        where = ".".join(str(part) for part in first["loc"])
-        raise BundleError(f"{path}: {where}: {first['msg']}; copy or build the bundle again", field=FILE) from error
-    _require_consistent(path, manifest)
+        part = ".".join(str(each) for each in first["loc"])
+        raise BundleError(f"{where}: {part}: {first['msg']}; copy or build the bundle again", field=FILE) from error
+    _require_consistent(where, manifest)
     return manifest
 
 
@@ -241,21 +254,21 @@ def dataset_error(directory: Path) -> BundleError | None:
     )
 
 
-def _require_format(path: Path, data: bytes) -> None:
+def _require_format(where: str, data: bytes) -> None:
     try:
         document = json.loads(data)
         found = document["format"]
     except (ValueError, KeyError, TypeError, RecursionError) as error:
-        raise BundleError(f"{path}: not a valid manifest; copy or build the bundle again", field=FILE) from error
+        raise BundleError(f"{where}: not a valid manifest; copy or build the bundle again", field=FILE) from error
     if found != FORMAT:
         raise BundleError(
-            f"{path}: format {found!r}, but this release reads format {FORMAT}; build the map with this release, "
+            f"{where}: format {found!r}, but this release reads format {FORMAT}; build the map with this release, "
             "or serve it with the release that built it",
             field=FILE,
         )
 
 
-def _require_consistent(path: Path, manifest: Manifest) -> None:
+def _require_consistent(where: str, manifest: Manifest) -> None:
     grid = manifest.grid
     if manifest.version != manifest.expected_version():
         what = f"version {manifest.version} does not match the content ({manifest.expected_version()})"
@@ -273,7 +286,7 @@ def _require_consistent(path: Path, manifest: Manifest) -> None:
         what = f"tiles: {wrong}"
     else:
         return
-    raise BundleError(f"{path}: {what}; copy or build the bundle again", field=FILE)
+    raise BundleError(f"{where}: {what}; copy or build the bundle again", field=FILE)
 
 
 def _wrong_tiles(manifest: Manifest) -> str | None:

@@ -78,17 +78,20 @@ class LocalTiles:
         return self.path / tile.folder
 
 
-def open_map(path: Path, *, verify: bool = True) -> Map:
+def open_map(path: Path, *, verify: bool = True, source: TileSource | None = None) -> Map:
     """Open a map of one bundle or a tiled map.
 
     Args:
         path: folder of the map.
         verify: compare the hash of every file with the manifest. Those of a tile are compared when it is first opened.
+        source: where the tiles of a tiled map come from; None takes them from ``path``.
 
     Raises:
         BundleError: the map is missing, damaged, of another format, or inconsistent.
     """
-    return TiledMap.open(path, verify=verify) if read_manifest(path).tiles else MapBundle.open(path, verify=verify)
+    if read_manifest(path).tiles:
+        return TiledMap.open(path, verify=verify, source=source)
+    return MapBundle.open(path, verify=verify)
 
 
 class OpenTiles:
@@ -223,12 +226,21 @@ class OpenTiles:
             self._regions = {key: region for key, region in self._regions.items() if closed not in key}
 
     def _open(self, tile: Tile, *, verify: bool) -> MapBundle:
-        folder = self._source.folder(tile)
-        try:
-            return self._opened_from(folder, tile, verify=verify)
-        except BundleError as error:  # a request may open the tile, and its answer names no folder of the machine
-            message = error.message.replace(str(folder), f"map {self._manifest.name}, {tile.folder}")
-            raise BundleError(message, field=error.field) from error
+        """Open a tile. A request may do so, and its answer names no folder of the machine and no address."""
+        named = f"map {self._manifest.name}, {tile.folder}"
+        for is_last in (False, True):
+            try:
+                folder = self._source.folder(tile)
+            except BundleError as error:
+                what = f"{named}: the tile cannot be fetched; the log of the service says why"
+                raise BundleError(what, field=error.field) from error
+            try:
+                return self._opened_from(folder, tile, verify=verify)
+            except BundleError as error:
+                if is_last or folder.exists():
+                    raise BundleError(error.message.replace(str(folder), named), field=error.field) from error
+                # A cache deleted it meanwhile.
+        raise AssertionError  # the last turn returns or raises
 
     def _opened_from(self, folder: Path, tile: Tile, *, verify: bool) -> MapBundle:
         try:
