@@ -295,6 +295,8 @@ def _run_ray(
     pending: dict[Any, tuple[int, int]] = {}
     try:
         cluster_cores = int(ray.cluster_resources().get("CPU", 1))
+        # A task that asks for more than any machine has would wait for ever.
+        largest = int(0.9 * max(node["Resources"].get("memory", 0.0) for node in ray.nodes() if node["Alive"]))
         board = ray.remote(num_cpus=0)(_Board).remote()
         # Ray's own retries would not be reported.
         build = ray.remote(num_cpus=1, max_retries=0)(_in_task)
@@ -303,7 +305,8 @@ def _run_ray(
             # More than run at once, so that no core waits for this process.
             while waiting and len(pending) < (workers or 2 * cluster_cores):
                 index, attempts = waiting.popleft()
-                pending[build.remote(board, index, tasks[index])] = index, attempts
+                memory = min(memory_of(tasks[index]), largest)
+                pending[build.options(memory=memory).remote(board, index, tasks[index])] = index, attempts
             ready, _ = ray.wait(list(pending), timeout=_EVERY_S)
             with suppress(RayActorError):  # the actor's machine is lost; the tiles still report their end
                 for index, share in ray.get(board.take.remote()).items():
