@@ -167,6 +167,12 @@ def update(
     if replace and replace_area is not None:
         raise typer.BadParameter("give --replace or --replace-area, not both")
     require_map_first(bundle, dataset, "map update")
+    if (edge_m := read_manifest(bundle).tile_m) is not None:
+        raise BundleError(
+            f"{bundle}: a tiled map cannot be updated with a dataset; build a tiled map of the survey (`streetfix build-map {dataset} "
+            f"--tile-m {edge_m:g}` with the same encoder), and join both with `streetfix map merge`",
+            field="bundle",
+        )
     with bars() as report:
         made = update_map(
             bundle,
