@@ -149,7 +149,7 @@ bench-training: .venv/.torch ## measure training and simulation -> reports/train
 bench-serving: .venv/.torch ## measure the service under load -> reports/serving.json; ARGS="--only ratios tail" measures parts
 	$(BIN)/python -m benchmarks.serving $(ARGS)
 
-bench-scale: .venv/.torch ## search in maps of up to a hundred towns, tiled maps -> reports/scale.json; ARGS="--only built" or "--sizes 489000 10000000" for parts
+bench-scale: .venv/.torch ## search in maps of up to a hundred towns, tiled maps, object storage -> reports/scale.json; ARGS="--only built" or "--sizes 489000 10000000" for parts
 	$(BIN)/python -m benchmarks.scale $(ARGS)
 
 fuzz: .venv/.torch ## a million inputs to every parser of untrusted input -> reports/serving.json
