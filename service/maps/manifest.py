@@ -19,8 +19,6 @@ FILE = "manifest.json"
 DATASET_FILE = "dataset.json"
 #: Fields that describe when and with which tools the bundle was built. They do not affect the version.
 _CIRCUMSTANCES = {"version", "made_at", "tool_versions"}
-#: Fields of a tile that depend on the build time of the tile. The version of a tile stands for its content.
-_CIRCUMSTANCES_OF_TILE = {"manifest_sha256", "size"}
 
 #: Folder of the tiles of a tiled map.
 TILES_FOLDER = "tiles"
@@ -96,16 +94,14 @@ class Tile(_Frozen):
     Attributes:
         column: the tile has the places with ``column * tile_m <= x < (column + 1) * tile_m``, map frame, metres.
         row: the same for y.
-        version: version of the bundle.
-        manifest_sha256: SHA-256 of its ``manifest.json``, which has the hashes of its other files.
-        size: size of all its files, bytes.
+        version: version of the bundle: the hash of its content, which includes the hashes of its files.
+        size: size of all its files without ``manifest.json``, bytes.
         counts: sizes of its parts.
     """
 
     column: int = Field(ge=-MOST_TILES, le=MOST_TILES)
     row: int = Field(ge=-MOST_TILES, le=MOST_TILES)
     version: Version
-    manifest_sha256: Sha256
     size: int = Field(ge=0)
     counts: Counts
 
@@ -174,12 +170,9 @@ class Manifest(_Frozen):
     def expected_version(self) -> str:
         """Return the version: the first 16 hexadecimal digits of the SHA-256 of the content.
 
-        The build time and the tool versions do not count, nor do those of the tiles. So the same content gives the same version.
+        The build time and the tool versions do not count. So the same content gives the same version.
         """
         content = {name: value for name, value in self._document().items() if name not in _CIRCUMSTANCES}
-        if "tiles" in content:
-            tiles = content["tiles"]
-            content["tiles"] = [{k: v for k, v in tile.items() if k not in _CIRCUMSTANCES_OF_TILE} for tile in tiles]
         return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:16]
 
     def stamped(self) -> "Manifest":

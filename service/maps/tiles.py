@@ -27,7 +27,6 @@ from service.maps.manifest import Manifest, Tile, read_manifest
 from service.maps.map import Map
 from service.maps.reader import MapBundle
 from service.maps.streets import Streets
-from service.maps.writer import sha256_of
 from service.registration.surfel_map import SurfelMap
 from service.registration.surfel_tiles import SurfelTiles, nearest_square
 
@@ -243,13 +242,9 @@ class OpenTiles:
         raise AssertionError  # the last turn returns or raises
 
     def _opened_from(self, folder: Path, tile: Tile, *, verify: bool) -> MapBundle:
-        try:
-            found = sha256_of(folder / manifest.FILE)
-        except OSError as error:
-            raise defect(folder / manifest.FILE, f"cannot be read ({error.strerror})") from error
-        if found != tile.manifest_sha256:
-            raise defect(folder / manifest.FILE, "not the tile that the map lists; the hash does not match")
         bundle = MapBundle.open(folder, verify=verify)
+        if bundle.manifest.version != tile.version:
+            raise defect(folder / manifest.FILE, f"version {bundle.manifest.version}, but the map lists {tile.version}")
         if different := differences(bundle.manifest, self._manifest):
             raise defect(folder / manifest.FILE, f"{different[0]} is not that of the map")
         if bundle.manifest.counts != tile.counts:

@@ -1,6 +1,5 @@
 """Fetch bundles from a store: many files at once, each checked against its manifest."""
 
-import hashlib
 import os
 import threading
 from collections.abc import Callable, Collection, Iterable, Mapping
@@ -89,7 +88,7 @@ def tile_manifest(remote: Remote, tile: Tile) -> tuple[Manifest, bytes]:
         tile: of the map's manifest.
 
     Returns:
-        The manifest, and its bytes, whose hash is that of the map's manifest.
+        The manifest, and its bytes.
 
     Raises:
         BundleError: the manifest is missing, cannot be read, or is another one.
@@ -97,36 +96,11 @@ def tile_manifest(remote: Remote, tile: Tile) -> tuple[Manifest, bytes]:
     name = f"{tile.folder}/{FILE}"
     found = remote.read(name)
     data = b"" if found is None else found[0]
-    if not is_manifest_of(tile, data):
-        data = remote.read_if_there(other_manifest(tile)) or data
-    where = f"{remote.url}/{name}"
-    require_tile_manifest(data, tile, where)
-    return parsed_manifest(data, where), data
+    return parsed_tile_manifest(data, tile, f"{remote.url}/{name}"), data
 
 
-def other_manifest(tile: Tile) -> str:
-    """Return where a store has the manifest of a tile whose folder has another manifest already.
-
-    The same content may have been built twice. The two manifests differ in their dates, and two versions of the map refer to them.
-
-    Args:
-        tile: of the map's manifest.
-    """
-    return f"{tile.folder}/manifest-{tile.manifest_sha256[:16]}.json"
-
-
-def is_manifest_of(tile: Tile, data: bytes | None) -> bool:
-    """Return whether bytes are the manifest of a tile.
-
-    Args:
-        tile: of the map's manifest.
-        data: the bytes; None if there are none.
-    """
-    return data is not None and hashlib.sha256(data).hexdigest() == tile.manifest_sha256
-
-
-def require_tile_manifest(data: bytes, tile: Tile, where: str) -> None:
-    """Check that bytes are the manifest of a tile.
+def parsed_tile_manifest(data: bytes, tile: Tile, where: str) -> Manifest:
+    """Check that bytes are the manifest of a tile. Its version is the hash of its content.
 
     Args:
         data: the bytes.
@@ -136,10 +110,27 @@ def require_tile_manifest(data: bytes, tile: Tile, where: str) -> None:
     Raises:
         BundleError: they are not.
     """
-    if not is_manifest_of(tile, data):
+    manifest = parsed_manifest(data, where)
+    if manifest.version != tile.version or manifest.tiles:
         raise BundleError(
-            f"{where}: the hash does not match the manifest of the map; copy or push the map again", field=FILE
+            f"{where}: not the bundle of tile {tile.column} {tile.row}, which the map lists; copy or push the map again",
+            field=FILE,
         )
+    return manifest
+
+
+def is_manifest_of(tile: Tile, data: bytes | None, where: str) -> bool:
+    """Return whether bytes are the manifest of a tile.
+
+    Args:
+        tile: of the map's manifest.
+        data: the bytes; None if there are none.
+        where: path or URL, for messages.
+    """
+    try:
+        return data is not None and parsed_tile_manifest(data, tile, where).version == tile.version
+    except BundleError:  # a damaged one is written again
+        return False
 
 
 def shared_files(manifest: Manifest, where: str, *, leave_out: Collection[str] = ()) -> dict[str, FileEntry]:

@@ -8,9 +8,8 @@ from contextlib import suppress
 from functools import partial
 from pathlib import Path
 
-from service.errors import BundleError
 from service.maps.content import NOT_SERVED
-from service.maps.manifest import FILE, TILES_FOLDER, Manifest, Tile, parsed_manifest, read_manifest
+from service.maps.manifest import FILE, Manifest, Tile, parsed_manifest, read_manifest
 from service.maps.store.cache import TileCache, is_used_now
 from service.maps.store.fetch import fetch_files, shared_files, shared_prefix, tile_manifest
 from service.maps.store.remote import Remote, checked_url
@@ -131,19 +130,13 @@ class StoreTiles:
         Raises:
             BundleError: the store cannot be read, a file is damaged, or the cache cannot be used.
         """
-        # A tile that was built again has the same version, but another date in its manifest.
-        folder = self._version.parent / TILES_FOLDER / f"{tile.version}-{tile.manifest_sha256[:16]}"
+        folder = self._version.parent / tile.folder
         if not is_used_now(folder):
             self._cache.once(folder, partial(self._fetch, tile))
         return folder
 
     def _fetch(self, tile: Tile, into: Path) -> None:
         manifest, data = tile_manifest(self._remote, tile)
-        if manifest.version != tile.version or manifest.tiles:
-            raise BundleError(
-                f"{self._remote.url}/{tile.folder}/{FILE}: not the bundle of tile {tile.column} {tile.row}; push the map again",
-                field=FILE,
-            )
         files = {name: entry for name, entry in manifest.files.items() if name not in NOT_SERVED}
         shared = self._shared_by_hash()
         for name in [name for name, entry in files.items() if entry.sha256 in shared]:

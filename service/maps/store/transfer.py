@@ -17,8 +17,7 @@ from service.maps.store.fetch import (
     concurrently,
     fetch_files,
     is_manifest_of,
-    other_manifest,
-    require_tile_manifest,
+    parsed_tile_manifest,
     shared_files,
     shared_prefix,
     tile_manifest,
@@ -91,18 +90,14 @@ def push(folder: Path, url: str, *, report: Report = lambda *_: None) -> Copied:
     shared = shared_files(manifest, str(folder / FILE))
     missing = _missing_tiles(remote, manifest)
     progress = _Progress("push (MB)", _size_of(shared) + sum(each.size for each in manifest.tiles), report)
-    progress.skip(sum(each.size for each in manifest.tiles) - sum(each.size for each, _ in missing))
-    for tile, other in missing:
+    progress.skip(sum(each.size for each in manifest.tiles) - sum(each.size for each in missing))
+    for tile in missing:
         place = folder / tile.folder
-        of_tile = read_manifest(place)
         in_tile = _read(place / FILE)
-        require_tile_manifest(in_tile, tile, str(place / FILE))
-        if other:  # the same content under a manifest with another date, which an earlier version of the map refers to
-            progress.skip(_size_of(of_tile.files))
-        else:
-            _put_files(remote, f"{tile.folder}/", place, of_tile.files, progress)
-        remote.put(other_manifest(tile) if other else f"{tile.folder}/{FILE}", in_tile)
-        progress.add(len(in_tile))
+        _put_files(
+            remote, f"{tile.folder}/", place, parsed_tile_manifest(in_tile, tile, str(place / FILE)).files, progress
+        )
+        remote.put(f"{tile.folder}/{FILE}", in_tile)
     prefix = f"{VERSIONS_FOLDER}/{manifest.version}/"
     if remote.read_if_there(prefix + FILE) is not None:
         progress.skip(_size_of(shared))
@@ -170,7 +165,7 @@ def _pull(remote: Remote, manifest: Manifest, data: bytes, into: Path, report: R
     for tile in manifest.tiles:
         place = into / tile.folder
         if place.is_dir():
-            if is_manifest_of(tile, (place / FILE).read_bytes()):
+            if is_manifest_of(tile, (place / FILE).read_bytes(), str(place / FILE)):
                 progress.skip(tile.size)
                 continue
             shutil.rmtree(place)
@@ -185,23 +180,20 @@ def _pull_tile(remote: Remote, tile: Tile, progress: _Progress, into: Path) -> N
     manifest, data = tile_manifest(remote, tile)
     fetch_files(remote, f"{tile.folder}/", manifest.files, into, told=progress.add)
     (into / FILE).write_bytes(data)
-    progress.add(len(data))
 
 
-def _missing_tiles(remote: Remote, manifest: Manifest) -> list[tuple[Tile, bool]]:
-    """Return the tiles whose manifests the store lacks, and for each whether it has the same content under another manifest."""
+def _missing_tiles(remote: Remote, manifest: Manifest) -> list[Tile]:
+    """Return the tiles whose manifests the store lacks."""
     missing = []
 
     def look(tile: Tile, go_on: Callable[[], None]) -> None:
         go_on()
-        data = remote.read_if_there(f"{tile.folder}/{FILE}")
-        if not is_manifest_of(tile, data) and (
-            data is None or not is_manifest_of(tile, remote.read_if_there(other_manifest(tile)))
-        ):
-            missing.append((tile, data is not None))
+        name = f"{tile.folder}/{FILE}"
+        if not is_manifest_of(tile, remote.read_if_there(name), f"{remote.url}/{name}"):
+            missing.append(tile)
 
     concurrently(partial(look, each) for each in manifest.tiles)
-    return sorted(missing, key=lambda each: (each[0].column, each[0].row))
+    return sorted(missing, key=lambda each: (each.column, each.row))
 
 
 def _put_files(remote: Remote, prefix: str, folder: Path, files: Mapping[str, FileEntry], progress: _Progress) -> None:

@@ -41,13 +41,11 @@ class KilledError(Exception):
 
 
 def files_of(folder):
-    """Return every file of a map; manifests without the time of the build and what follows from it."""
+    """Return every file of a map; manifests without the time of the build."""
     found = {str(p.relative_to(folder)): p.read_bytes() for p in sorted(folder.rglob("*")) if p.is_file()}
     for name in [name for name in found if name.endswith("manifest.json")]:
         manifest = json.loads(found[name])
         del manifest["made_at"]
-        for tile in manifest.get("tiles", ()):
-            del tile["manifest_sha256"], tile["size"]
         found[name] = json.dumps(manifest).encode()
     return found
 

@@ -180,7 +180,7 @@ def test_the_search_index_chooses_the_tiles_of_a_large_map(
     assert beside.T_map_place[:, 0, 3].tolist() == [10.0] * 12 + [60.0] * 12
 
 
-@pytest.mark.parametrize("name", ["descriptors.npy", "cloud/surfels.npy", "manifest.json"])
+@pytest.mark.parametrize("name", ["descriptors.npy", "cloud/surfels.npy"])
 def test_a_damaged_tile_is_refused_when_it_opens(tiled_copy: Path, name: str) -> None:
     opened = TiledMap.open(tiled_copy)
     tile = tiled_copy / opened.manifest.tiles[0].folder / name
@@ -192,10 +192,19 @@ def test_a_damaged_tile_is_refused_when_it_opens(tiled_copy: Path, name: str) ->
     opened.tiles.get(1)
 
 
+def test_another_bundle_in_the_folder_of_a_tile_is_refused(tiled_copy: Path) -> None:
+    opened = TiledMap.open(tiled_copy)
+    one, other = (tiled_copy / tile.folder for tile in opened.manifest.tiles[:2])
+    shutil.rmtree(one)
+    shutil.copytree(other, one)
+    with pytest.raises(BundleError, match=f"version {other.name}, but the map lists {one.name}"):
+        opened.tiles.get(0)
+
+
 def test_a_missing_tile_is_refused_when_it_opens(tiled_copy: Path) -> None:
     opened = TiledMap.open(tiled_copy)
     shutil.rmtree(tiled_copy / opened.manifest.tiles[1].folder)
-    with pytest.raises(BundleError, match=r"manifest.json: cannot be read"):
+    with pytest.raises(BundleError, match=r"not a map bundle: manifest.json is missing"):
         opened.tiles.get(1)
 
 
