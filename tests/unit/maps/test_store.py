@@ -2,7 +2,6 @@
 
 import hashlib
 import json
-import multiprocessing
 import shutil
 import subprocess
 import sys
@@ -449,42 +448,18 @@ class TestBound:
             StoredMap(file_url, TileCache(tmp_path / "cache", 10**9)).refresh()
 
 
-def _fetch_in_process(url: str, folder: Path, number: int, barrier: object, told: object) -> None:
-    """Fetch all tiles, and tell which files were read from the store."""
-    names: list[str] = []
-    save = Remote.save
-
-    def counted(self: Remote, name: str, *arguments: object, **named: object) -> None:
-        names.append(name)
-        time.sleep(0.01)
-        save(self, name, *arguments, **named)  # type: ignore[arg-type]
-
-    Remote.save = counted  # type: ignore[method-assign]
-    found = StoredMap(url, TileCache(folder, 10**9))
-    barrier.wait(30)  # type: ignore[attr-defined]
-    found.refresh()
-    (version,) = [each for each in found.folder.iterdir() if (each / "manifest.json").exists()]
-    tiles = found.tiles(version)
-    for tile in read_manifest(version).tiles:
-        MapBundle.open(tiles.folder(tile))
-    told.put(names)  # type: ignore[attr-defined]
-
-
 def test_two_processes_fetch_each_file_once(town: Path, url: str, tmp_path: Path) -> None:
     push(town, url)
-    spawn = multiprocessing.get_context("spawn")
-    barrier, told = spawn.Barrier(2), spawn.Queue()
-    processes = [
-        spawn.Process(target=_fetch_in_process, args=(url, tmp_path / "cache", number, barrier, told))
-        for number in range(2)
-    ]
+    script, begin = Path(__file__).with_name("fetch_tiles.py"), tmp_path / "begin"
+    command = [sys.executable, str(script), url, str(tmp_path / "cache"), str(begin)]
+    processes = [subprocess.Popen(command, stdout=subprocess.PIPE, text=True) for _ in range(2)]
     for each in processes:
-        each.start()
-    names = [*told.get(timeout=60), *told.get(timeout=60)]
-    for each in processes:
-        each.join(30)
-        assert each.exitcode == 0
-    assert len(names) == len(set(names))
+        assert each.stdout is not None
+        assert each.stdout.readline() == "ready\n"
+    begin.touch()
+    names = [name for each in processes for name in json.loads(each.communicate(timeout=60)[0])]
+    assert [each.returncode for each in processes] == [0, 0]
+    assert len(names) == len(set(names)) > 0
     assert left_over(tmp_path / "cache") == []
 
 
