@@ -38,6 +38,8 @@ MOST_AROUND = 2 * MOST_SEARCHED
 LISTED = 1_000
 #: Limit of the size of all open tiles, bytes. The system keeps only the parts in memory that queries read.
 OPEN_BYTES = 4 * 2**30
+#: Tiles so near to the position of a query are expected next, m.
+EXPECT_M = 300.0
 #: Largest number of regions that are kept, each put together from several tiles.
 MOST_REGIONS = 16
 _NEEDED = (parts.ENCODER_FILE, parts.PLACES_FILE, parts.CALIBRATION_FILE)
@@ -55,6 +57,13 @@ class TileSource(Protocol):
 
         Raises:
             BundleError: the tile is missing or damaged, or cannot be fetched.
+        """
+
+    def expect(self, tiles: Sequence[Tile]) -> None:
+        """Prepare for tiles that will probably be asked for soon, without waiting.
+
+        Args:
+            tiles: the most probable first. They replace those of the call before.
         """
 
 
@@ -75,6 +84,13 @@ class LocalTiles:
             tile: as the manifest of the map lists it.
         """
         return self.path / tile.folder
+
+    def expect(self, tiles: Sequence[Tile]) -> None:
+        """Do nothing, because the tiles are there.
+
+        Args:
+            tiles: tiles of the map.
+        """
 
 
 def open_map(path: Path, *, verify: bool = True, source: TileSource | None = None) -> Map:
@@ -124,6 +140,7 @@ class OpenTiles:
         self._path, self._manifest, self._source = path, of_map, source
         self._street_number = street_numbers(of_streets)
         self._verify, self._limit = verify, open_bytes
+        self._expected: tuple[int, ...] = ()
         self._verified = set[int]()  # numbers of the tiles whose hashes this process has compared
         self._opened: OrderedDict[int, MapBundle] = OrderedDict()
         self._regions: dict[tuple[int, ...], Map] = {}
@@ -167,6 +184,21 @@ class OpenTiles:
                 self._opened[number] = made
                 self._close_some()
             return made
+
+    def expect_around(self, xy_m: Float64[NDArray[np.float64], "2"]) -> None:
+        """Tell the source which closed tiles a moving camera may reach soon.
+
+        Args:
+            xy_m: x and y of the camera, map frame, m.
+        """
+        away_m = _away_m(self.squares_m, xy_m)
+        near = [int(number) for number in np.argsort(away_m, kind="stable")[:9] if 0 < away_m[number] <= EXPECT_M]
+        with self._changing:
+            closed = tuple(number for number in near if number not in self._opened)
+            is_news = bool(closed) and closed != self._expected
+            self._expected = closed
+        if is_news:
+            self._source.expect([self._manifest.tiles[number] for number in closed])
 
     def region(self, numbers: tuple[int, ...], make: Callable[[tuple[int, ...]], Map]) -> Map:
         """Return the parts of some tiles together. They are kept as long as all of these tiles are open.
@@ -402,6 +434,8 @@ class TiledMap(Map):
             near: x and y (m, map frame) and radius (m) of the area where the camera is; None if unknown. If no tile is there, all count.
         """
         chosen = np.arange(len(self.tiles))
+        if near is not None:
+            self.tiles.expect_around(near[0])
         if near is not None and (inside := _away_m(self.tiles.squares_m, near[0]) <= near[1]).any():
             chosen = np.flatnonzero(inside)
         if len(chosen) > MOST_SEARCHED and self.inverted is not None:
@@ -419,6 +453,7 @@ class TiledMap(Map):
             positions_m: positions, map frame, m, the most important first. They lie in few tiles. A position in a tile beyond
                 ``MOST_AROUND`` counts as one at the edge of the nearest of the others.
         """
+        self.tiles.expect_around(positions_m[0, :2])
         return self._region(in_order(nearest_square(self.tiles.squares_m, positions_m[:, :2]))[:MOST_AROUND])
 
     def _region(self, numbers: Int64[NDArray[np.int64], " n"]) -> Map:

@@ -41,6 +41,9 @@ class _LoggedTiles:
         self._tiles = tiles
         self.has_failed = False
 
+    def expect(self, tiles: Sequence[Tile]) -> None:
+        self._tiles.expect(tiles)
+
     def folder(self, tile: Tile) -> Path:
         try:
             return self._tiles.folder(tile)

@@ -3,11 +3,14 @@
 import hashlib
 import os
 import re
-from collections.abc import Collection, Mapping
+import threading
+from collections import deque
+from collections.abc import Collection, Mapping, Sequence
 from contextlib import suppress
 from functools import partial
 from pathlib import Path
 
+from service.errors import BundleError
 from service.maps.content import NOT_SERVED
 from service.maps.manifest import FILE, Manifest, Tile, parsed_manifest, read_manifest
 from service.maps.store.cache import TileCache, is_used_now
@@ -116,6 +119,9 @@ class StoreTiles:
 
     def __init__(self, remote: Remote, cache: TileCache, version: Path) -> None:
         self._remote, self._cache, self._version = remote, cache, version
+        self._expected = deque[Tile]()
+        self._expecting = threading.Lock()
+        self._fetches_ahead = False
         self._shared: Mapping[str, Path] | None = None
 
     def folder(self, tile: Tile) -> Path:
@@ -134,6 +140,29 @@ class StoreTiles:
         if not is_used_now(folder):
             self._cache.once(folder, partial(self._fetch, tile))
         return folder
+
+    def expect(self, tiles: Sequence[Tile]) -> None:
+        """Fetch tiles in the background, one after the other.
+
+        Args:
+            tiles: the most probable first. Those of the call before that are not fetched yet are forgotten.
+        """
+        with self._expecting:
+            self._expected = deque(tiles)
+            if self._fetches_ahead:
+                return
+            self._fetches_ahead = True
+        threading.Thread(target=self._fetch_ahead, name="fetch tiles ahead", daemon=True).start()
+
+    def _fetch_ahead(self) -> None:
+        while True:
+            with self._expecting:
+                if not self._expected:
+                    self._fetches_ahead = False
+                    return
+                tile = self._expected.popleft()
+            with suppress(BundleError):  # the request that needs the tile fetches it again, and says what is wrong
+                self.folder(tile)
 
     def _fetch(self, tile: Tile, into: Path) -> None:
         manifest, data = tile_manifest(self._remote, tile)

@@ -481,6 +481,20 @@ def test_threads_fetch_a_tile_once(
     assert len(names) == len(set(names)) > 0
 
 
+def test_expected_tiles_are_fetched_in_the_background(town: Path, file_url: str, cache: TileCache) -> None:
+    push(town, file_url)
+    found, _, manifest, tiles = stored(file_url, cache)
+    shutil.rmtree(store_of(file_url) / manifest.tiles[0].folder)  # a failure does not stop the others
+    tiles.expect(manifest.tiles)
+    wanted = {found.folder / tile.folder for tile in manifest.tiles[1:]}
+    deadline = time.monotonic() + 30
+    while not all(each.is_dir() for each in wanted) and time.monotonic() < deadline:
+        time.sleep(0.01)
+    assert all(each.is_dir() for each in wanted)
+    with pytest.raises(BundleError):
+        tiles.folder(manifest.tiles[0])
+
+
 def test_who_waited_for_a_failed_fetch_tries_itself(town: Path, file_url: str, cache: TileCache) -> None:
     push(town, file_url)
     found, _, manifest, tiles = stored(file_url, cache)

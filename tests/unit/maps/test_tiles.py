@@ -123,6 +123,25 @@ def test_a_prior_opens_only_its_own_tile(tiled: TiledMap, small_dataset: Any) ->
     assert again.tiles.opened == (0,)
 
 
+def test_closed_tiles_near_a_camera_are_expected_once(tiled_path: Path) -> None:
+    class Source(LocalTiles):
+        def expect(self, tiles: Any) -> None:
+            asked.append([(tile.column, tile.row) for tile in tiles])
+
+    asked: list[list[tuple[int, int]]] = []
+    opened = TiledMap.open(tiled_path, source=Source(tiled_path))
+    numbers = [(tile.column, tile.row) for tile in opened.manifest.tiles]
+    middle = opened.tiles.squares_m[0].reshape(2, 2).mean(axis=0)
+    for _ in range(2):
+        opened.tiles.expect_around(middle)
+    assert len(asked) == 1
+    assert sorted(asked[0]) == sorted(numbers[1:])  # that of the camera is opened anyway
+    opened.tiles.get(1)
+    opened.tiles.expect_around(middle)
+    opened.tiles.expect_around(middle + 1e6)
+    assert asked[1:] == ([[n for n in asked[0] if n != numbers[1]]] if len(numbers) > 2 else [])
+
+
 def test_tiles_are_closed_beyond_the_limit(tiled_path: Path, small_dataset: Any) -> None:
     small, large = TiledMap.open(tiled_path, open_bytes=1), TiledMap.open(tiled_path)
     for query in queries_of(small_dataset, large):
