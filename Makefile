@@ -125,7 +125,7 @@ release-proto: .venv/.torch ## record the gRPC messages of a release; later ones
 lock: .venv/.uv ## renew the lock files; ARGS="--upgrade" takes newer packages
 	$(COMPILE) --extra dev --group oracle $(ARGS) --output-file locks/dev.txt
 	$(COMPILE) --extra mapping --constraint locks/dev.txt --output-file locks/mapping.txt
-	$(COMPILE) --extra server --constraint locks/dev.txt --output-file locks/service.txt
+	$(COMPILE) --extra server --extra store --constraint locks/dev.txt --output-file locks/service.txt
 	$(COMPILE_BUILD) --constraint locks/dev.txt $(ARGS) --output-file locks/build.txt
 
 evaluate: .venv/.torch ## measure accuracy -> reports/accuracy.json
@@ -149,7 +149,7 @@ bench-training: .venv/.torch ## measure training and simulation -> reports/train
 bench-serving: .venv/.torch ## measure the service under load -> reports/serving.json; ARGS="--only ratios tail" measures parts
 	$(BIN)/python -m benchmarks.serving $(ARGS)
 
-bench-scale: .venv/.torch ## search in maps of up to a hundred towns, tiled maps -> reports/scale.json; ARGS="--only built" or "--sizes 489000 10000000" for parts
+bench-scale: .venv/.torch ## search in maps of up to a hundred towns, tiled maps, object storage -> reports/scale.json; ARGS="--only built" or "--sizes 489000 10000000" for parts
 	$(BIN)/python -m benchmarks.scale $(ARGS)
 
 fuzz: .venv/.torch ## a million inputs to every parser of untrusted input -> reports/serving.json

@@ -37,6 +37,7 @@ PAGES = (
     "python",
     "deploy",
     "serving",
+    "operate",
     "console",
     "confidence",
     "measuring",

@@ -1,5 +1,6 @@
 """Record the files of the service that one real request passes through."""
 
+import inspect
 import socket
 import threading
 from dataclasses import dataclass, field
@@ -57,7 +58,9 @@ class Trace:
             self._depth -= 1
 
 
-_ENGINE: frozenset[CodeType] = frozenset({Engine.localize.__code__, Engine.localize_sequence.__code__})
+_ENGINE: frozenset[CodeType] = frozenset(
+    inspect.unwrap(each).__code__ for each in (Engine.localize, Engine.localize_sequence)
+)
 
 
 def trace_of_request(bundle: Path, parts: dict[str, tuple[str, bytes, str]]) -> Trace:

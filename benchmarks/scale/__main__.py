@@ -1,4 +1,4 @@
-"""``make bench-scale``: search in maps of up to a hundred towns, requests on tiled maps, and tiled builds -> reports/scale.json.
+"""``make bench-scale``: search in maps of up to a hundred towns, tiled maps, tiled builds, and object storage -> reports/scale.json.
 
 The first run simulates two small cities and builds their maps, whose descriptors it keeps. A hundred towns need 5 GB of memory and
 2 GB of disk. The part ``built`` kills builds and compares both engines. For the second row, install the extra ``ray``.
@@ -17,13 +17,15 @@ from benchmarks.scale.built import built_rows
 from benchmarks.scale.drawn import DrawnViews
 from benchmarks.scale.search import SIZES, search_rows
 from benchmarks.scale.served import served_rows
-from benchmarks.scale.sources import RealDescriptors, real_descriptors
+from benchmarks.scale.sources import RealDescriptors, real_descriptors, small_city
+from benchmarks.scale.store import store_rows
+from model_training.datasets.dataset import Dataset
 from model_training.stock import ENCODER
 from service.maps.index import vectors_of
 from service.retrieval.encoder import Encoder
 
 #: Parts of the report.
-PARTS = ("search", "served", "built")
+PARTS = ("search", "served", "built", "store")
 #: Code that determines the real descriptors.
 _DESCRIBING = (*SIMULATION, "service/imaging", "benchmarks/scale/sources.py", "model_training/mapping/places.py")
 
@@ -64,7 +66,14 @@ def main() -> None:
         choices=PARTS,
         default=list(PARTS),
         help="what to measure: search in drawn maps, requests with a prior on a tiled map (served), tiled builds that are killed, and both "
-        "engines (built)",
+        "engines (built), a map in object storage (store)",
+    )
+    parser.add_argument(
+        "--stored",
+        nargs=2,
+        type=Path,
+        metavar=("MAP", "DATASET"),
+        help="map for the part store, and its dataset with queries; by default a small city",
     )
     arguments = parser.parse_args()
     if min(arguments.sizes) < 10_000:
@@ -81,6 +90,10 @@ def main() -> None:
         report.write()
     if "built" in arguments.only:
         built_rows(report, Runs(arguments.work, ENCODER))
+        report.write()
+    if "store" in arguments.only:
+        path, dataset = arguments.stored or small_city(Runs(arguments.work, ENCODER))
+        store_rows(report, path, Dataset(dataset), arguments.work)
         report.write()
 
 

@@ -66,6 +66,23 @@ def city_plan(index: int) -> SimulationPlan:
     return SimulationPlan(name=f"scale-{index + 1}", seed=EVALUATION_SEEDS[40 + index], size_m=CITY_M, queries=queries)
 
 
+def small_city(runs: Runs) -> tuple[Path, Path]:
+    """Return the map of the first city and its dataset; simulate and build what is not kept.
+
+    Args:
+        runs: simulates and builds, or reuses what is kept on disk.
+    """
+    dataset = runs.dataset(city_plan(0))
+    return _bundle(runs, dataset).path, dataset.folder
+
+
+def _bundle(runs: Runs, dataset: Dataset) -> MapBundle:
+    settings = BuildSettings(
+        name=dataset.name, headings=HEADINGS, align_survey=False, traffic_vote=False, calibration=None
+    )
+    return runs.bundle(dataset, settings)
+
+
 def real_descriptors(runs: Runs) -> RealDescriptors:
     """Return the descriptors of all cities; simulate and build what is not kept.
 
@@ -79,10 +96,7 @@ def real_descriptors(runs: Runs) -> RealDescriptors:
     true_view: list[int] = []
     for index in range(CITIES):
         dataset = runs.dataset(city_plan(index))
-        settings = BuildSettings(
-            name=dataset.name, headings=HEADINGS, align_survey=False, traffic_vote=False, calibration=None
-        )
-        bundle = runs.bundle(dataset, settings)
+        bundle = _bundle(runs, dataset)
         first = sum(len(each) for each in views)
         views.append(bundle.view_index.vectors(np.arange(bundle.manifest.counts.views)))
         for asked, true in _queries(dataset, bundle):

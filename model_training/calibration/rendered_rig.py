@@ -35,6 +35,7 @@ from service.maps.manifest import Manifest
 from service.option_limits import LEAST_HEIGHT_M, MOST_HEIGHT_M
 from service.registration.points import FOCAL_BASELINE_PX_M
 from service.registration.surfel_map import SurfelMap
+from service.registration.surfel_tiles import Cloud
 from service.registration.visibility import DiscSettings, SurfelRaycaster
 from service.retrieval.query import Query
 
@@ -207,13 +208,14 @@ def frames_of_rig(
         raise BundleError(
             f"{bundle.path}: the map has no cloud to render images from; build the map again", field="cloud"
         )
-    cloud = bundle.cloud.at(bundle.T_map_place[0, :3, 3])
-    dark = Localizer(replace(bundle, cloud=replace(cloud, brightness=None)), localizer.encoder)
+    whole = bundle.cloud
+    dark = Localizer(replace(bundle, cloud=without_brightness(whole)), localizer.encoder)
     count = min(IMAGES, len(bundle.T_map_place))
     places = np.linspace(0, len(bundle.T_map_place) - 1, count).astype(int)
 
     def ask(number: int) -> _Pair | None:
-        found = _rendered(cloud, bundle.manifest, bundle.T_map_place[places[number]], rig, number)
+        T_map_place = bundle.T_map_place[places[number]]
+        found = _rendered(whole.at(T_map_place[:3, 3]), bundle.manifest, T_map_place, rig, number)
         if found is None:
             return None
         query, T_map_camera = found
@@ -237,6 +239,15 @@ def frames_of_rig(
             frames_of([pair[2] for pair in there], none, all_, block),
         ]
     )
+
+
+def without_brightness(cloud: Cloud) -> Cloud:
+    """Return a cloud without intensities, because rendered images would agree with them too well.
+
+    Args:
+        cloud: cloud of a map.
+    """
+    return replace(cloud, brightness=None) if isinstance(cloud, SurfelMap) else replace(cloud, has_brightness=False)
 
 
 #: Confidence features in the map (None: not registered), whether the answer is right, and confidence features without the surroundings.

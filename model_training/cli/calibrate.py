@@ -5,6 +5,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated
 
+import numpy as np
 import typer
 from rich.console import Console
 
@@ -19,7 +20,8 @@ from model_training.stock import CALIBRATION, ENCODER
 from service.errors import BundleError, DatasetError
 from service.localization.localizer import Localizer
 from service.maps.calibration import Calibration
-from service.maps.reader import MapBundle
+from service.maps.map import Map
+from service.maps.tiles import MOST_AROUND, TiledMap, open_map
 from service.maps.writer import replace_calibration
 
 #: Folder of cities, maps and answers if none is given.
@@ -141,7 +143,7 @@ def _calibrate_rig(
 ) -> None:
     began = time.monotonic()
     console = Console(highlight=False, soft_wrap=True)
-    bundle = MapBundle.open(folder)
+    bundle = part_for(open_map(folder), source)
     calibration = bundle.calibration
     if calibration is None:
         raise BundleError(
@@ -179,6 +181,31 @@ def _calibrate_rig(
     else:
         _write(out, corrected)
         console.print(f"written: {out}")
+
+
+def part_for(opened: Map, source: Dataset | RigFile) -> Map:
+    """Return the part of a map that calibrates a rig: all of it, or of a tiled map the tiles of the recording.
+
+    Args:
+        opened: the map.
+        source: the recording, or the rig whose images are rendered from the first tile.
+
+    Raises:
+        BundleError: the map has too many tiles to localize a recording without ground truth in all of them.
+    """
+    if not isinstance(opened, TiledMap):
+        return opened
+    if isinstance(source, RigFile):
+        return opened.around(np.array(opened.T_map_place[:1, :3, 3]))
+    frames = [frame for name in source.query_sets(with_truth=True) for frame in source.queries(name)]
+    positions = [frame.T_map_camera[:3, 3] for frame in frames if frame.T_map_camera is not None]
+    if not positions and len(opened.tiles) > MOST_AROUND:
+        raise BundleError(
+            f"{opened.path}: the map has {len(opened.tiles)} tiles, and the recording does not say in which it was made; give a recording "
+            "with queries/NAME/poses.txt, or calibrate on one of the tiles with --out",
+            field="tiles",
+        )
+    return opened.around(np.array(positions) if positions else opened.T_map_place[:, :3, 3])
 
 
 def _write(out: Path, calibration: Calibration) -> None:

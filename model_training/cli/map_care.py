@@ -20,10 +20,15 @@ from service.errors import BundleError
 from service.maps.calibration import RigCorrection
 from service.maps.manifest import read_manifest
 from service.maps.reader import MapBundle
+from service.maps.store.transfer import Copied
+from service.maps.store.transfer import pull as pull_map
+from service.maps.store.transfer import push as push_map
 from service.maps.tiles import open_map
 
 app = typer.Typer(
-    no_args_is_help=True, rich_markup_mode=None, help="Maintain map bundles: info, verify, diff, merge, update."
+    no_args_is_help=True,
+    rich_markup_mode=None,
+    help="Maintain map bundles: info, verify, diff, merge, update, push, pull.",
 )
 
 _Bundle = Annotated[Path, typer.Argument(help="Folder of a map bundle.")]
@@ -162,6 +167,12 @@ def update(
     if replace and replace_area is not None:
         raise typer.BadParameter("give --replace or --replace-area, not both")
     require_map_first(bundle, dataset, "map update")
+    if (edge_m := read_manifest(bundle).tile_m) is not None:
+        raise BundleError(
+            f"{bundle}: a tiled map cannot be updated with a dataset; build a tiled map of the survey (`streetfix build-map {dataset} "
+            f"--tile-m {edge_m:g}` with the same encoder), and join both with `streetfix map merge`",
+            field="bundle",
+        )
     with bars() as report:
         made = update_map(
             bundle,
@@ -174,6 +185,51 @@ def update(
             report=report,
         )
     Console().print(f"{describe(made)}: {out}")
+
+
+@app.command()
+def push(
+    bundle: Annotated[Path, typer.Argument(help="Folder of a map bundle or of a tiled map.", metavar="MAP")],
+    url: Annotated[
+        str, typer.Argument(help="URL of the map: s3://, gs:// or az://BUCKET/PATH, or file:///FOLDER.", metavar="URL")
+    ],
+) -> None:
+    """Copy a map into object storage.
+
+    The command skips tiles that the store has. If it was interrupted, run it again. The new version appears when it is whole.
+    Credentials come from the environment (docs/operate.md). Needs the extra `store`.
+
+    \b
+    Example:
+      streetfix map push maps/town s3://bucket/maps/town
+    """
+    with bars() as report:
+        copied = push_map(bundle, url, report=report)
+    Console(soft_wrap=True).print(f"{_copied_text(copied)}: {url}", highlight=False)
+
+
+@app.command()
+def pull(
+    url: Annotated[str, typer.Argument(help="URL of a map in object storage.", metavar="URL")],
+    out: Annotated[Path, typer.Argument(help="Folder of the map. It must not exist.", metavar="OUT")],
+) -> None:
+    """Copy a whole map out of object storage.
+
+    The command checks the hash of every file. If it was interrupted, run it again. Needs the extra `store`.
+
+    \b
+    Example:
+      streetfix map pull s3://bucket/maps/town maps/town
+    """
+    with bars() as report:
+        copied = pull_map(url, out, report=report)
+    Console(soft_wrap=True).print(f"{_copied_text(copied)}: {out}", highlight=False)
+
+
+def _copied_text(copied: Copied) -> str:
+    manifest = copied.manifest
+    tiles = f", {copied.tiles} tiles copied, {copied.kept} there already" if manifest.tiles else ""
+    return f"map {manifest.name}, version {manifest.version}, {copied.size / 1e6:.1f} MB copied{tiles}"
 
 
 def _rig_of(bundle: Path) -> RigCorrection | None:

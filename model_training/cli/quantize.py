@@ -9,12 +9,12 @@ import typer
 from rich.console import Console
 
 from model_training.cli.progress import bars
-from model_training.training.draws import augmented_batches
 from model_training.training.encoder_net import EncoderShape
 from model_training.training.loop import TrainingConfig
 from model_training.training.packs import make_packs
 from model_training.training.quantise import Views, quantise
 from model_training.training.recipe import stock_plans
+from model_training.training.sampling import augmented_batches
 from service.imaging.view_grid import ViewGrid
 from service.retrieval.encoder import Encoder
 

@@ -70,4 +70,5 @@ def _bundles(path: Path, manifest: Manifest) -> list[Manifest]:
 def _size(path: Path, manifest: Manifest) -> int:
     """Return the size of all files of a map, bytes."""
     shared = sum(entry.size for entry in manifest.files.values()) + (path / FILE).stat().st_size
-    return shared + sum(tile.size for tile in manifest.tiles)
+    tiles = sum(tile.size + (path / tile.folder / FILE).stat().st_size for tile in manifest.tiles)
+    return shared + tiles

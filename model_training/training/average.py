@@ -13,9 +13,9 @@ from pathlib import Path
 
 import torch
 
-from model_training.training.draws import augmented_batches
 from model_training.training.encoder_net import EncoderNet, queries_first
 from model_training.training.loop import TrainingConfig, load_run, read_checkpoint, read_config, read_packs
+from model_training.training.sampling import augmented_batches
 from service.errors import DatasetError
 
 #: Batches that set the statistics of batch normalisation.

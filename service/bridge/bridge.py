@@ -9,10 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.bridge.diagnostics import Counts, Diagnosis, Level, of_answer
-from service.bridge.gate import Gate
 from service.bridge.pairs import Pair, Pairs, nanoseconds_of
 from service.bridge.pictures import camera_from, depth_from, is_rectified_by_name, rgb_from
 from service.bridge.pose import CAMERA_AS_BODY, StampedPose, pose_of
+from service.bridge.publish_policy import PublishPolicy
 from service.contract.schema import LocalizeAnswer
 from service.errors import StreetfixError
 from service.geometry.camera import PinholeCamera
@@ -68,7 +68,7 @@ class Bridge:
     Attributes:
         localize: answers a query; a ``StreetfixError`` becomes a diagnosis.
         topics: named in messages.
-        gate: query rate, and which answers are published.
+        policy: query rate, and which answers are published.
         pairs: received messages.
         T_vehicle_camera: from the camera frame to the vehicle frame, metres.
         frame_id: of the map.
@@ -79,7 +79,7 @@ class Bridge:
 
     localize: Localize
     topics: Topics = field(default_factory=Topics)
-    gate: Gate = field(default_factory=Gate)
+    policy: PublishPolicy = field(default_factory=PublishPolicy)
     pairs: Pairs = field(default_factory=Pairs)
     T_vehicle_camera: Transform = field(default_factory=CAMERA_AS_BODY.copy)
     frame_id: str = "map"
@@ -90,7 +90,7 @@ class Bridge:
 
     def wait_s(self) -> float:
         """Return the seconds until the next query is due. Until then messages need not be read."""
-        return self.gate.wait_s(self.clock())
+        return self.policy.wait_s(self.clock())
 
     def step(self) -> Published | None:
         """Send a query for the newest pair, if there is one and a query is due; else return None.
@@ -99,12 +99,12 @@ class Bridge:
         """
         if self.wait_s() > 0:
             return None
-        pair = self.pairs.newest() if self.gate.rate_hz else self.pairs.oldest()
+        pair = self.pairs.newest() if self.policy.rate_hz else self.pairs.oldest()
         return None if pair is None else self._ask(pair)
 
     def quiet_s(self) -> float:
         """Return the longest time without a query, seconds, that is no lack of images: ``IDLE_S``, or two periods of a slow rate."""
-        return max(IDLE_S, 2.0 / self.gate.rate_hz) if self.gate.rate_hz else IDLE_S
+        return max(IDLE_S, 2.0 / self.policy.rate_hz) if self.policy.rate_hz else IDLE_S
 
     def idle(self) -> Diagnosis:
         """Build the diagnosis for a time without image pairs."""
@@ -118,7 +118,7 @@ class Bridge:
 
     def _ask(self, pair: Pair) -> Published:
         stamp_ns, began = nanoseconds_of(pair.color), self.clock()
-        self.gate.record_query(began)
+        self.policy.record_query(began)
         self._recent_s.append(began)
         self.counts.queries += 1
         try:
@@ -130,7 +130,7 @@ class Bridge:
             self.counts.failed += 1
             return Published(None, Diagnosis(stamp_ns, Level.ERROR, error.message, self._counted()), None)
         self.counts.answered += 1
-        why_not = self.gate.why_not(answer)
+        why_not = self.policy.why_not(answer)
         pose = None
         if not why_not:
             pose = pose_of(answer, self.T_vehicle_camera, stamp_ns=stamp_ns, frame_id=self.frame_id)

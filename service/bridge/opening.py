@@ -5,9 +5,9 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 
 from service.bridge.bridge import Bridge, Localize, Topics
-from service.bridge.gate import Gate
 from service.bridge.pairs import Pairs
 from service.bridge.pose import CAMERA_AS_BODY, height_from, mount_from
+from service.bridge.publish_policy import PublishPolicy
 from service.bridge.settings import BridgeSettings
 from service.errors import RequestError
 from service.imaging.level import GivenHeight
@@ -32,7 +32,7 @@ def opened(settings: BridgeSettings) -> Iterator[Bridge]:
     topics = Topics(
         settings.color_topic, settings.depth_topic, settings.info_topic, settings.pose_topic, settings.diagnostics_topic
     )
-    gate, pairs = Gate(settings.rate, settings.min_confidence), Pairs(tolerance_s=settings.tolerance)
+    policy, pairs = PublishPolicy(settings.rate, settings.min_confidence), Pairs(tolerance_s=settings.tolerance)
     mount = None if settings.mount is None else mount_from(settings.mount)
     height = height_from(settings.camera_height_m, mount, base_on_ground=settings.base_on_ground)
     if settings.queue < 0:
@@ -44,7 +44,7 @@ def opened(settings: BridgeSettings) -> Iterator[Bridge]:
         yield Bridge(
             localize=localize,
             topics=topics,
-            gate=gate,
+            policy=policy,
             pairs=pairs,
             T_vehicle_camera=CAMERA_AS_BODY if mount is None else mount,
             frame_id=settings.frame,

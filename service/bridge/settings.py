@@ -34,8 +34,8 @@ class BridgeSettings:
         base_on_ground: see ``height_from``.
         camera_height_m: see ``height_from``.
         rectified: see ``camera_from``.
-        rate: see ``Gate``, Hz.
-        min_confidence: see ``Gate``.
+        rate: see ``PublishPolicy``, Hz.
+        min_confidence: see ``PublishPolicy``.
         tolerance: see ``Pairs``, seconds.
         reliable: request lost images again.
         queue: images that wait during a query.

@@ -32,6 +32,7 @@ EXTRA_OF_PACKAGE = {
     "carla": "carla",
     "ray": "ray",
     "cyclonedds": "ros2",
+    "obstore": "store",
     "rerun": "view",
     "foxglove": "view",
 }

@@ -184,7 +184,8 @@ def _check_choice(
         return
     missing = [option for option, value in single.items() if value is None]
     if missing:
-        raise typer.BadParameter(f"missing {', '.join(missing)}; or give --sequence FILE or --batch FILE")
+        why = " (every query needs a depth image of the same moment)" if "--depth" in missing else ""
+        raise typer.BadParameter(f"missing {', '.join(missing)}{why}; or give --sequence FILE or --batch FILE")
 
 
 def _answer_batch(connection: Connection, path: Path, overrides: Overrides, *, as_json: bool) -> None:

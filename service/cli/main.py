@@ -24,7 +24,7 @@ _KNOWN = {
     "convert": ("Write a dataset as a ROS bag or in KITTI's layout.", "mapping"),
     "streets": ("Import named streets from GeoJSON, OpenDRIVE or OpenStreetMap.", "mapping"),
     "build-map": ("Build a map bundle from a dataset's survey.", "mapping"),
-    "map": ("Maintain map bundles: info, verify, diff, merge, update.", "mapping"),
+    "map": ("Maintain map bundles: info, verify, diff, merge, update, push, pull.", "mapping"),
     "calibrate": ("Fit the confidence of an encoder on calibration cities.", "mapping"),
     "evaluate": ("Measure the answers of a map against ground truth.", "mapping"),
     "compare": ("Compare two runs over the same queries.", "mapping"),

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from service.cli.pair_files import ImagePair, read_sequence
-from service.errors import BundleError, RefusedError, RequestError
+from service.errors import BundleError, RefusedError, RequestError, UnreachableError
 
 A = TypeVar("A")
 _TIMEOUT_S = 60.0
@@ -284,10 +284,11 @@ def _send(
     ) as client:
         try:
             return client.call(rest.Call("POST", path, read, files))
-        except RefusedError as error:
-            about_map = error.field.endswith("map") and overrides.map_name is not None
-            if about_map and (wrong := _folder_for_a_name(overrides.map_name or "")):
-                raise RequestError(f"{wrong}\n  {error.detail}", field="map") from error
+        except (RefusedError, UnreachableError) as error:
+            about_map = isinstance(error, UnreachableError) or error.field.endswith("map")
+            if about_map and overrides.map_name is not None and (wrong := _folder_for_a_name(overrides.map_name)):
+                detail = error.detail if isinstance(error, RefusedError) else error.message
+                raise RequestError(f"{wrong}\n  {detail}", field="map") from error
             raise
 
 

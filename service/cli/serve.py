@@ -36,8 +36,12 @@ METRICS_FOLDER = "PROMETHEUS_MULTIPROC_DIR"
 
 def command(
     maps: Annotated[
-        list[Path] | None,
-        typer.Argument(metavar="BUNDLE", help="Map bundles, or folders of them.", show_default=False),
+        list[str] | None,
+        typer.Argument(
+            metavar="BUNDLE",
+            help="Map bundles, folders of them, or URLs of maps in object storage (s3://, gs://, az://, file://).",
+            show_default=False,
+        ),
     ] = None,
     host: Annotated[str | None, typer.Option(help="Address to listen on.  [default: 127.0.0.1]")] = None,
     port: Annotated[int | None, typer.Option(help="HTTP port. 0 lets the system choose.  [default: 8000]")] = None,
@@ -60,6 +64,15 @@ def command(
     samples: Annotated[
         Path | None,
         typer.Option(help="Folder of sample queries for the console.", show_default=False),
+    ] = None,
+    tile_cache: Annotated[
+        Path | None,
+        typer.Option(
+            help="Folder for maps from object storage.  [default: ~/.cache/streetfix/tiles]", show_default=False
+        ),
+    ] = None,
+    tile_cache_bytes: Annotated[
+        int | None, typer.Option(help="Bound of the tiles in that folder.  [default: 20000000000]")
     ] = None,
     check: Annotated[
         bool,
@@ -94,6 +107,7 @@ def command(
     \b
     Example:
       streetfix serve maps/paper-city --port 8000 --grpc-port 50051
+      streetfix serve s3://bucket/maps/town --tile-cache /var/cache/streetfix
     """
     from service.runtime.threads import limit_pools_before_import
 
@@ -113,6 +127,8 @@ def command(
             strict=strict,
             false_accept_rate=false_accept_rate,
             samples=samples,
+            tile_cache=tile_cache,
+            tile_cache_bytes=tile_cache_bytes,
         )
     )
 

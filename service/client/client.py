@@ -181,7 +181,9 @@ class Client:
         while True:
             try:
                 with rest.errors_of_httpx(self._url, self._timeout_s, self._tls):
-                    response = self._http.request(call.method, call.path, files=call.files or None)
+                    response = self._http.request(
+                        call.method, call.path, files=call.files or None, headers=call.headers
+                    )
                 return rest.answer_of(call, response)
             except StreetfixError as error:
                 wait_s = attempts.wait_after(error)

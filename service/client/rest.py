@@ -14,6 +14,7 @@ from urllib.parse import quote
 import httpx
 from pydantic import BaseModel, ValidationError
 
+from service.client.cells import HEADER, cell_of
 from service.client.prepare import PreparedRequest
 from service.client.problems import refused
 from service.client.tls import ClientTls, closed_hint, handshake_error, ssl_reason
@@ -36,12 +37,14 @@ class Call(Generic[A]):
         read: function that reads the answer from the body of a successful response. It raises ValueError (or
             ValidationError) if the body is not an answer.
         files: parts of a multipart body: file name, content and media type, by part name.
+        headers: further headers.
     """
 
     method: str
     path: str
     read: Callable[[bytes], A]
     files: dict[str, tuple[str, bytes, str]] = field(default_factory=dict)
+    headers: dict[str, str] = field(default_factory=dict)
 
 
 class Problem(BaseModel):
@@ -81,7 +84,11 @@ def localize(prepared: PreparedRequest[schema.LocalizeRequest]) -> Call[schema.L
     """
     (rgb, depth), *_ = prepared.pictures
     return Call(
-        "POST", "/v1/localize", schema.LocalizeAnswer.model_validate_json, _parts(prepared, rgb=rgb, depth=depth)
+        "POST",
+        "/v1/localize",
+        schema.LocalizeAnswer.model_validate_json,
+        _parts(prepared, rgb=rgb, depth=depth),
+        {HEADER: cell_of(prepared.document.prior, prepared.document.map)},
     )
 
 

@@ -7,8 +7,7 @@ import numpy as np
 from jaxtyping import Float64
 from numpy.typing import NDArray
 
-from service.confidence.extrapolation import extrapolated
-from service.confidence.features import FEATURES
+from service.confidence.features import FEATURES, IDEALS
 from service.confidence.reasons import Reason, reasons_of
 from service.confidence.spread import Extent, Spread, spread_of
 from service.errors import RequestError
@@ -25,6 +24,8 @@ KNOWN = 0.5
 #: The best candidate of an accepted answer must hold more than half of the support of all distinct candidates. The threshold on
 #: confidence rejects out-of-map queries. It does not reject perceptual aliases, such as six blocks that look the same (decision 0086).
 _SHARE, _HALF = FEATURES.index("log_share"), float(np.log(0.5))
+#: Width of the margin beyond the knots of a term, as a share of the distance between the first and the last.
+MARGIN = 0.1
 
 
 @dataclass(frozen=True, slots=True)
@@ -211,3 +212,34 @@ def _spread_over(candidates: tuple[Candidate, ...], frames: int, confidence: flo
         confidence=confidence,
         extent=extent,
     )
+
+
+def extrapolated(
+    calibration: Calibration, evidence: Float64[NDArray[np.float64], " F"] | None
+) -> tuple[tuple[str, float], ...]:
+    """Return the features that the confidence uses and that lie outside the range of the calibration data.
+
+    The confidence does not follow a feature beyond the first and the last knot of its term. The range is wider by ``MARGIN`` of the
+    distance between the knots, because a few of the calibration's own queries lie just outside. A feature with an ideal, such as no
+    distance to the nearest place, has no end on that side: the answer gets no more credit there than the best calibration data.
+
+    Args:
+        calibration: calibration of the map.
+        evidence: confidence features of an answer; None without registration, then the result is empty.
+
+    Returns:
+        Name, and signed distance from the mean of the calibration data in standard deviations, the farthest first.
+    """
+    if evidence is None:
+        return ()
+    away = calibration.deviations(evidence)
+    outside = []
+    for term in calibration.right.terms:
+        column = calibration.names.index(term.feature)
+        margin = MARGIN * (term.knots[-1] - term.knots[0])
+        ideal = IDEALS.get(term.feature, 0)
+        below = ideal >= 0 and evidence[column] < term.knots[0] - margin
+        above = ideal <= 0 and evidence[column] > term.knots[-1] + margin
+        if below or above:
+            outside.append((term.feature, float(away[column])))
+    return tuple(sorted(outside, key=lambda each: (-abs(each[1]), each[0])))

@@ -16,10 +16,10 @@ from google.protobuf.message_factory import GetMessageClass
 
 from service.errors import BusyError, RequestError, StreetfixError
 from service.grpc.call import Call
+from service.grpc.deadline_watchdog import DeadlineWatchdog
 from service.grpc.generated.streetfix.v1 import localization_pb2 as pb
 from service.grpc.memory import MessageMemory, held_by_call
 from service.grpc.parsing import parsed
-from service.grpc.patience import Patience
 
 if TYPE_CHECKING:
     _Interceptor = grpc.ServerInterceptor[Any, Any]
@@ -38,14 +38,16 @@ class ReadingInterceptor(_Interceptor):
     """Reads raw bytes instead of letting gRPC parse. It ends calls that send nothing, and refuses bytes that do not parse.
 
     Args:
-        patience: ends calls that take too long.
+        watchdog: ends calls that take too long.
         memory: limits the number of calls that read at once.
         timeout_s: time limit for the only message of a call of LocalizationService.
         answering: ends refused calls.
     """
 
-    def __init__(self, patience: Patience, memory: MessageMemory, *, timeout_s: float, answering: Answering) -> None:
-        self._patience = patience
+    def __init__(
+        self, watchdog: DeadlineWatchdog, memory: MessageMemory, *, timeout_s: float, answering: Answering
+    ) -> None:
+        self._watchdog = watchdog
         self._memory = memory
         self._timeout_s = timeout_s
         self._answering = answering
@@ -144,7 +146,7 @@ class ReadingInterceptor(_Interceptor):
         def in_turn(messages: Messages, context: grpc.ServicerContext) -> Iterator[Message]:
             while True:
                 try:
-                    with self._memory.turn_of_others(streams=True), self._patience.at_most(OTHERS_S, context.cancel):
+                    with self._memory.turn_of_others(streams=True), self._watchdog.at_most(OTHERS_S, context.cancel):
                         raw = next(messages, None)
                 except StreetfixError as error:
                     self._end(error, method, context)
@@ -173,7 +175,7 @@ class ReadingInterceptor(_Interceptor):
     def _next(self, messages: Messages, method: str, context: grpc.ServicerContext, timeout_s: float) -> bytes:
         """Read the only message of a call. If none arrives, the call ends."""
         try:
-            with self._patience.at_most(timeout_s, context.cancel):
+            with self._watchdog.at_most(timeout_s, context.cancel):
                 raw = next(messages, None)
         except grpc.RpcError as error:
             self._end(error, method, context)

@@ -11,10 +11,10 @@ from grpc_reflection.v1alpha import reflection
 from service.errors import AddressError
 from service.grpc.answering import answering
 from service.grpc.auth import AuthInterceptor
+from service.grpc.deadline_watchdog import DeadlineWatchdog
 from service.grpc.generated.streetfix.v1.localization_pb2_grpc import add_LocalizationServiceServicer_to_server
 from service.grpc.health import Health
 from service.grpc.memory import MessageMemory
-from service.grpc.patience import Patience
 from service.grpc.reading import SERVICE, ReadingInterceptor
 from service.grpc.servicer import Servicer
 from service.runtime.engine import Engine
@@ -53,12 +53,12 @@ class GrpcServer:
         credentials: grpc.ServerCredentials | None = None,
     ) -> None:
         settings = engine.settings
-        self._patience = Patience()
+        self._watchdog = DeadlineWatchdog()
         memory = MessageMemory(
             engine.memory, most_bytes=settings.limits.message_bytes, most_streams=settings.grpc_streams
         )
         reading = ReadingInterceptor(
-            self._patience, memory, timeout_s=settings.request_timeout_s, answering=partial(answering, engine)
+            self._watchdog, memory, timeout_s=settings.request_timeout_s, answering=partial(answering, engine)
         )
         # Each call needs a waiting thread; the workers of the engine do the work. A stream holds its thread until it ends.
         most = engine.admission.capacity + settings.grpc_streams + _SPARE
@@ -78,7 +78,7 @@ class GrpcServer:
             maximum_concurrent_rpcs=most,
             interceptors=[reading] if keys is None else [AuthInterceptor(keys, engine.metrics.requested), reading],
         )
-        servicer = Servicer(engine, self._patience, memory)
+        servicer = Servicer(engine, self._watchdog, memory)
         add_LocalizationServiceServicer_to_server(servicer, self._server)  # type: ignore[no-untyped-call]  # generated code
         health_pb2_grpc.add_HealthServicer_to_server(Health(engine, ("", SERVICE)), self._server)
         reflection.enable_server_reflection((SERVICE, HEALTH, reflection.SERVICE_NAME), self._server)
@@ -95,7 +95,7 @@ class GrpcServer:
 
     def start(self) -> None:
         """Start to answer calls."""
-        self._patience.start()
+        self._watchdog.start()
         self._server.start()
 
     def begin_stop(self, *, grace_s: float) -> Event:
@@ -114,4 +114,4 @@ class GrpcServer:
             grace_s: seconds after which running calls are cancelled.
         """
         self.begin_stop(grace_s=grace_s).wait()
-        self._patience.stop()
+        self._watchdog.stop()

@@ -13,11 +13,11 @@ from service.contract.schema import MOST_FRAMES
 from service.errors import BusyError, DeadlineError, RequestError, StreetfixError
 from service.grpc.answering import answering
 from service.grpc.call import Call
+from service.grpc.deadline_watchdog import DeadlineWatchdog
 from service.grpc.generated.streetfix.v1 import localization_pb2 as pb
 from service.grpc.generated.streetfix.v1.localization_pb2_grpc import LocalizationServiceServicer
 from service.grpc.memory import MessageMemory
 from service.grpc.messages import answer_message, map_message, request_from, sequence_request_from, transform_from
-from service.grpc.patience import Patience
 from service.grpc.status import problem_message
 from service.runtime.engine import Engine, Located
 from service.runtime.stream import Stream
@@ -29,13 +29,13 @@ class Servicer(LocalizationServiceServicer):
 
     Args:
         engine: does the work.
-        patience: ends streams that send no frame.
+        watchdog: ends streams that send no frame.
         memory: for the messages of streams.
     """
 
-    def __init__(self, engine: Engine, patience: Patience, memory: MessageMemory) -> None:
+    def __init__(self, engine: Engine, watchdog: DeadlineWatchdog, memory: MessageMemory) -> None:
         self._engine = engine
-        self._patience = patience
+        self._watchdog = watchdog
         self._memory = memory
 
     def Localize(self, request: pb.LocalizeRequest, context: grpc.ServicerContext) -> pb.LocalizeResponse:
@@ -169,7 +169,7 @@ class Servicer(LocalizationServiceServicer):
         """
         with fields_under(f"frame {number}"):
             try:
-                with self._patience.at_most(self._engine.settings.grpc_idle_s, context.cancel):
+                with self._watchdog.at_most(self._engine.settings.grpc_idle_s, context.cancel):
                     return next(requests, None)
             except RequestError as error:
                 error.field = error.field.removeprefix(

@@ -7,8 +7,7 @@ import numpy as np
 from jaxtyping import Float64
 from numpy.typing import NDArray
 
-from service.confidence.decision import Decision, decision_of
-from service.confidence.extrapolation import extrapolated
+from service.confidence.decision import Decision, decision_of, extrapolated
 from service.geometry.rigid import Transform, inverse, nearest_rigid
 from service.localization.answer import Answer, require_finite
 from service.localization.belief import Belief, Mode, Seen, agrees, moved, sighting_of, size_of

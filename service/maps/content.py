@@ -17,6 +17,8 @@ CALIBRATION_FILE, PREVIEW_FILE = "calibration.json", "preview.webp"
 CLOUD_FOLDER = "cloud"
 #: Voxel statistics for merging and updating maps. The service only checks the hash of this file.
 STATISTICS_FILE = "voxels.zst"
+#: Files that the service does not read. A folder that only serves may lack them (``maps/store``).
+NOT_SERVED = frozenset({STATISTICS_FILE, PREVIEW_FILE})
 
 #: Largest coordinate of a pose (m). Largest error of an entry of R R^T, which allows for rounded numbers.
 MOST_AWAY_M, _SKEW = 1e7, 1e-3

@@ -18,7 +18,7 @@ REMEDY = "copy or build the bundle again"
 
 
 def require_files(path: Path, manifest: Manifest, needed: Iterable[str], *, verify: bool) -> None:
-    """Check that the files of a bundle are there, and that they are those of the manifest.
+    """Check that the files of a bundle are there, and that they are those of the manifest. Files that the service does not read may lack.
 
     Args:
         path: the bundle's folder.
@@ -34,6 +34,8 @@ def require_files(path: Path, manifest: Manifest, needed: Iterable[str], *, veri
             raise defect(path / name, "not listed in the manifest")
     for name, entry in manifest.files.items():
         file = path / name
+        if name in parts.NOT_SERVED and not file.exists():
+            continue
         if not file.is_file() or not file.resolve().is_relative_to(path.resolve()):
             raise defect(file, "missing, or outside the bundle")
         try:

@@ -19,8 +19,6 @@ FILE = "manifest.json"
 DATASET_FILE = "dataset.json"
 #: Fields that describe when and with which tools the bundle was built. They do not affect the version.
 _CIRCUMSTANCES = {"version", "made_at", "tool_versions"}
-#: Fields of a tile that depend on the build time of the tile. The version of a tile stands for its content.
-_CIRCUMSTANCES_OF_TILE = {"manifest_sha256", "size"}
 
 #: Folder of the tiles of a tiled map.
 TILES_FOLDER = "tiles"
@@ -96,16 +94,14 @@ class Tile(_Frozen):
     Attributes:
         column: the tile has the places with ``column * tile_m <= x < (column + 1) * tile_m``, map frame, metres.
         row: the same for y.
-        version: version of the bundle.
-        manifest_sha256: SHA-256 of its ``manifest.json``, which has the hashes of its other files.
-        size: size of all its files, bytes.
+        version: version of the bundle: the hash of its content, which includes the hashes of its files.
+        size: size of all its files without ``manifest.json``, bytes.
         counts: sizes of its parts.
     """
 
     column: int = Field(ge=-MOST_TILES, le=MOST_TILES)
     row: int = Field(ge=-MOST_TILES, le=MOST_TILES)
     version: Version
-    manifest_sha256: Sha256
     size: int = Field(ge=0)
     counts: Counts
 
@@ -174,12 +170,9 @@ class Manifest(_Frozen):
     def expected_version(self) -> str:
         """Return the version: the first 16 hexadecimal digits of the SHA-256 of the content.
 
-        The build time and the tool versions do not count, nor do those of the tiles. So the same content gives the same version.
+        The build time and the tool versions do not count. So the same content gives the same version.
         """
         content = {name: value for name, value in self._document().items() if name not in _CIRCUMSTANCES}
-        if "tiles" in content:
-            tiles = content["tiles"]
-            content["tiles"] = [{k: v for k, v in tile.items() if k not in _CIRCUMSTANCES_OF_TILE} for tile in tiles]
         return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:16]
 
     def stamped(self) -> "Manifest":
@@ -213,14 +206,27 @@ def read_manifest(directory: Path) -> Manifest:
         raise dataset_error(directory) or BundleError(
             f"{directory}: not a map bundle: {FILE} {why}; give the folder that build-map wrote", field=FILE
         ) from error
-    _require_format(path, data)
+    return parsed_manifest(data, str(path))
+
+
+def parsed_manifest(data: bytes, where: str) -> Manifest:
+    """Check the content of a manifest.
+
+    Args:
+        data: content of ``manifest.json``.
+        where: path or URL of the file, for messages.
+
+    Raises:
+        BundleError: the manifest is malformed, of another format version, or inconsistent.
+    """
+    _require_format(where, data)
     try:
         manifest = Manifest.model_validate_json(data)
     except ValidationError as error:
         first = error.errors(include_url=False, include_input=False)[0]
-        where = ".".join(str(part) for part in first["loc"])
-        raise BundleError(f"{path}: {where}: {first['msg']}; copy or build the bundle again", field=FILE) from error
-    _require_consistent(path, manifest)
+        part = ".".join(str(each) for each in first["loc"])
+        raise BundleError(f"{where}: {part}: {first['msg']}; copy or build the bundle again", field=FILE) from error
+    _require_consistent(where, manifest)
     return manifest
 
 
@@ -241,21 +247,21 @@ def dataset_error(directory: Path) -> BundleError | None:
     )
 
 
-def _require_format(path: Path, data: bytes) -> None:
+def _require_format(where: str, data: bytes) -> None:
     try:
         document = json.loads(data)
         found = document["format"]
     except (ValueError, KeyError, TypeError, RecursionError) as error:
-        raise BundleError(f"{path}: not a valid manifest; copy or build the bundle again", field=FILE) from error
+        raise BundleError(f"{where}: not a valid manifest; copy or build the bundle again", field=FILE) from error
     if found != FORMAT:
         raise BundleError(
-            f"{path}: format {found!r}, but this release reads format {FORMAT}; build the map with this release, "
+            f"{where}: format {found!r}, but this release reads format {FORMAT}; build the map with this release, "
             "or serve it with the release that built it",
             field=FILE,
         )
 
 
-def _require_consistent(path: Path, manifest: Manifest) -> None:
+def _require_consistent(where: str, manifest: Manifest) -> None:
     grid = manifest.grid
     if manifest.version != manifest.expected_version():
         what = f"version {manifest.version} does not match the content ({manifest.expected_version()})"
@@ -273,7 +279,7 @@ def _require_consistent(path: Path, manifest: Manifest) -> None:
         what = f"tiles: {wrong}"
     else:
         return
-    raise BundleError(f"{path}: {what}; copy or build the bundle again", field=FILE)
+    raise BundleError(f"{where}: {what}; copy or build the bundle again", field=FILE)
 
 
 def _wrong_tiles(manifest: Manifest) -> str | None:

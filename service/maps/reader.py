@@ -32,7 +32,7 @@ class MapBundle(Map):
 
     @classmethod
     def open(cls, path: Path, *, verify: bool = True) -> "MapBundle":
-        """Open a bundle that ``write_bundle`` wrote.
+        """Open a bundle that ``write_bundle`` wrote. It may lack the files that the service does not read.
 
         Args:
             path: the bundle's folder.

@@ -91,13 +91,11 @@ def _link_tile(map_folder: Path, folder: Path, read: Manifest, square: tuple[int
         link_or_copy(folder / name, target / name)
     for each in {(target / name).parent for name in read.files} | {target, target.parent}:
         sync(each)
-    size = sum(entry.size for entry in read.files.values()) + (folder / manifest.FILE).stat().st_size
     return Tile(
         column=square[0],
         row=square[1],
         version=read.version,
-        manifest_sha256=sha256_of(target / manifest.FILE),
-        size=size,
+        size=sum(entry.size for entry in read.files.values()),
         counts=read.counts,
     )
 

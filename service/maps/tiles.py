@@ -27,7 +27,6 @@ from service.maps.manifest import Manifest, Tile, read_manifest
 from service.maps.map import Map
 from service.maps.reader import MapBundle
 from service.maps.streets import Streets
-from service.maps.writer import sha256_of
 from service.registration.surfel_map import SurfelMap
 from service.registration.surfel_tiles import SurfelTiles, nearest_square
 
@@ -39,6 +38,8 @@ MOST_AROUND = 2 * MOST_SEARCHED
 LISTED = 1_000
 #: Limit of the size of all open tiles, bytes. The system keeps only the parts in memory that queries read.
 OPEN_BYTES = 4 * 2**30
+#: Tiles so near to the position of a query are expected next, m.
+EXPECT_M = 300.0
 #: Largest number of regions that are kept, each put together from several tiles.
 MOST_REGIONS = 16
 _NEEDED = (parts.ENCODER_FILE, parts.PLACES_FILE, parts.CALIBRATION_FILE)
@@ -56,6 +57,13 @@ class TileSource(Protocol):
 
         Raises:
             BundleError: the tile is missing or damaged, or cannot be fetched.
+        """
+
+    def expect(self, tiles: Sequence[Tile]) -> None:
+        """Prepare for tiles that will probably be asked for soon, without waiting.
+
+        Args:
+            tiles: the most probable first. They replace those of the call before.
         """
 
 
@@ -77,18 +85,28 @@ class LocalTiles:
         """
         return self.path / tile.folder
 
+    def expect(self, tiles: Sequence[Tile]) -> None:
+        """Do nothing, because the tiles are there.
 
-def open_map(path: Path, *, verify: bool = True) -> Map:
+        Args:
+            tiles: tiles of the map.
+        """
+
+
+def open_map(path: Path, *, verify: bool = True, source: TileSource | None = None) -> Map:
     """Open a map of one bundle or a tiled map.
 
     Args:
         path: folder of the map.
         verify: compare the hash of every file with the manifest. Those of a tile are compared when it is first opened.
+        source: where the tiles of a tiled map come from; None takes them from ``path``.
 
     Raises:
         BundleError: the map is missing, damaged, of another format, or inconsistent.
     """
-    return TiledMap.open(path, verify=verify) if read_manifest(path).tiles else MapBundle.open(path, verify=verify)
+    if read_manifest(path).tiles:
+        return TiledMap.open(path, verify=verify, source=source)
+    return MapBundle.open(path, verify=verify)
 
 
 class OpenTiles:
@@ -122,6 +140,7 @@ class OpenTiles:
         self._path, self._manifest, self._source = path, of_map, source
         self._street_number = street_numbers(of_streets)
         self._verify, self._limit = verify, open_bytes
+        self._expected: tuple[int, ...] = ()
         self._verified = set[int]()  # numbers of the tiles whose hashes this process has compared
         self._opened: OrderedDict[int, MapBundle] = OrderedDict()
         self._regions: dict[tuple[int, ...], Map] = {}
@@ -165,6 +184,21 @@ class OpenTiles:
                 self._opened[number] = made
                 self._close_some()
             return made
+
+    def expect_around(self, xy_m: Float64[NDArray[np.float64], "2"]) -> None:
+        """Tell the source which closed tiles a moving camera may reach soon.
+
+        Args:
+            xy_m: x and y of the camera, map frame, m.
+        """
+        away_m = _away_m(self.squares_m, xy_m)
+        near = [int(number) for number in np.argsort(away_m, kind="stable")[:9] if 0 < away_m[number] <= EXPECT_M]
+        with self._changing:
+            closed = tuple(number for number in near if number not in self._opened)
+            is_news = bool(closed) and closed != self._expected
+            self._expected = closed
+        if is_news:
+            self._source.expect([self._manifest.tiles[number] for number in closed])
 
     def region(self, numbers: tuple[int, ...], make: Callable[[tuple[int, ...]], Map]) -> Map:
         """Return the parts of some tiles together. They are kept as long as all of these tiles are open.
@@ -223,21 +257,26 @@ class OpenTiles:
             self._regions = {key: region for key, region in self._regions.items() if closed not in key}
 
     def _open(self, tile: Tile, *, verify: bool) -> MapBundle:
-        folder = self._source.folder(tile)
-        try:
-            return self._opened_from(folder, tile, verify=verify)
-        except BundleError as error:  # a request may open the tile, and its answer names no folder of the machine
-            message = error.message.replace(str(folder), f"map {self._manifest.name}, {tile.folder}")
-            raise BundleError(message, field=error.field) from error
+        """Open a tile. A request may do so, and its answer names no folder of the machine and no address."""
+        named = f"map {self._manifest.name}, {tile.folder}"
+        for is_last in (False, True):
+            try:
+                folder = self._source.folder(tile)
+            except BundleError as error:
+                what = f"{named}: the tile cannot be fetched; the log of the service says why"
+                raise BundleError(what, field=error.field) from error
+            try:
+                return self._opened_from(folder, tile, verify=verify)
+            except BundleError as error:
+                if is_last or folder.exists():
+                    raise BundleError(error.message.replace(str(folder), named), field=error.field) from error
+                # A cache deleted it meanwhile.
+        raise AssertionError  # the last turn returns or raises
 
     def _opened_from(self, folder: Path, tile: Tile, *, verify: bool) -> MapBundle:
-        try:
-            found = sha256_of(folder / manifest.FILE)
-        except OSError as error:
-            raise defect(folder / manifest.FILE, f"cannot be read ({error.strerror})") from error
-        if found != tile.manifest_sha256:
-            raise defect(folder / manifest.FILE, "not the tile that the map lists; the hash does not match")
         bundle = MapBundle.open(folder, verify=verify)
+        if bundle.manifest.version != tile.version:
+            raise defect(folder / manifest.FILE, f"version {bundle.manifest.version}, but the map lists {tile.version}")
         if different := differences(bundle.manifest, self._manifest):
             raise defect(folder / manifest.FILE, f"{different[0]} is not that of the map")
         if bundle.manifest.counts != tile.counts:
@@ -395,6 +434,8 @@ class TiledMap(Map):
             near: x and y (m, map frame) and radius (m) of the area where the camera is; None if unknown. If no tile is there, all count.
         """
         chosen = np.arange(len(self.tiles))
+        if near is not None:
+            self.tiles.expect_around(near[0])
         if near is not None and (inside := _away_m(self.tiles.squares_m, near[0]) <= near[1]).any():
             chosen = np.flatnonzero(inside)
         if len(chosen) > MOST_SEARCHED and self.inverted is not None:
@@ -412,6 +453,7 @@ class TiledMap(Map):
             positions_m: positions, map frame, m, the most important first. They lie in few tiles. A position in a tile beyond
                 ``MOST_AROUND`` counts as one at the edge of the nearest of the others.
         """
+        self.tiles.expect_around(positions_m[0, :2])
         return self._region(in_order(nearest_square(self.tiles.squares_m, positions_m[:, :2]))[:MOST_AROUND])
 
     def _region(self, numbers: Int64[NDArray[np.int64], " n"]) -> Map:

@@ -76,7 +76,7 @@ def in_place(out: Path, what: str, remedy: str) -> Iterator[Path]:
 
 
 def replace_calibration(bundle: Path, calibration: Mapping[str, Any]) -> Manifest:
-    """Replace the calibration of a bundle atomically and return the new manifest.
+    """Replace the calibration of a bundle or of a tiled map atomically and return the new manifest.
 
     The map gets a new version, so a running service mounts it as one. The function writes a second bundle beside the first and renames it
     into place, as ``write_bundle`` does. All other files are hard links, or copies where the file system has no links. A process that has
@@ -104,7 +104,13 @@ def replace_calibration(bundle: Path, calibration: Mapping[str, Any]) -> Manifes
         made = old.model_copy(update={"files": files, "made_at": datetime.now(UTC)}).stamped()
         (partial / manifest.FILE).write_bytes(made.to_bytes())
         sync(partial / manifest.FILE)
-        for folder in {(partial / name).parent for name in old.files}:
+        of_tiles = [file for tile in old.tiles for file in (place / tile.folder).rglob("*") if file.is_file()]
+        for file in of_tiles:
+            target = partial / file.relative_to(place)
+            target.parent.mkdir(exist_ok=True, parents=True)
+            link_or_copy(file, target)
+        folders = {(partial / name).parent for name in old.files}
+        for folder in folders | {(partial / file.relative_to(place)).parent for file in of_tiles}:
             sync(folder)
         shutil.copymode(place, partial)
     return made

@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass, replace
 from functools import partial
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +17,8 @@ from service.localization.localizer import Localizer
 from service.localization.track_bytes import packed, unpacked
 from service.localization.tracker import Track, follow
 from service.maps.map import Map
+from service.maps.store.cache import TileCache, default_folder
+from service.maps.store.stored_map import StoredMap
 from service.option_limits import NEIGHBOURS
 from service.retrieval.prior import Prior
 from service.retrieval.query import DepthFormat, Query, decoded_query
@@ -34,7 +37,7 @@ from service.runtime.memory import (
 from service.runtime.metrics import Metrics
 from service.runtime.seal import Seal
 from service.runtime.serving_table import ServingTable
-from service.runtime.settings import Settings
+from service.runtime.settings import MapUrl, Settings
 from service.runtime.threads import limit_pools, usable_cores
 from service.runtime.tracing import Tracing
 from service.timing import stage, timed_request
@@ -119,7 +122,7 @@ class Engine:
     def __init__(self, registry: MapRegistry, settings: Settings, watcher: MapWatcher | None = None) -> None:
         self.registry = registry
         self.settings = settings
-        self.watcher = watcher or MapWatcher(registry, settings.maps, warm=partial(warm_up, settings.false_accept_rate))
+        self.watcher = watcher or watcher_of(registry, settings)
         self.threads = settings.threads or max(1, usable_cores() // settings.workers)
         self.admission = Admission(threads=self.threads, queue=settings.queue, initializer=limit_pools)
         self.memory = budget_of(settings, threads=self.threads)
@@ -145,7 +148,7 @@ class Engine:
         """
         limit_pools()
         registry = MapRegistry(provider=settings.provider, table=table)
-        watcher = MapWatcher(registry, settings.maps, warm=partial(warm_up, settings.false_accept_rate))
+        watcher = watcher_of(registry, settings)
         watcher.open_first(strict=settings.strict)
         return cls(registry, settings, watcher)
 
@@ -310,6 +313,25 @@ class Engine:
             hold.shrink_to(query.rgb.nbytes + query.depth_m.size * DEPTH_KEPT)
             hold.leave_with(query.depth_m)
         return query
+
+
+def watcher_of(registry: MapRegistry, settings: Settings) -> MapWatcher:
+    """Return the watcher of the maps of the settings. It has looked at none of them.
+
+    Args:
+        registry: where maps are mounted.
+        settings: checked.
+
+    Raises:
+        BundleError: there are maps in object storage, and the folder of the cache cannot be used.
+    """
+    stored = []
+    if urls := [each for each in settings.maps if isinstance(each, MapUrl)]:
+        cache = TileCache(settings.tile_cache or default_folder(), settings.tile_cache_bytes)
+        cache.clean()
+        stored = [StoredMap(each, cache) for each in urls]
+    paths = [each for each in settings.maps if isinstance(each, Path)]
+    return MapWatcher(registry, paths, warm=partial(warm_up, settings.false_accept_rate), stored=stored)
 
 
 def warm_up(false_accept_rate: float, localizer: Localizer) -> None:

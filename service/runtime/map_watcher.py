@@ -2,6 +2,7 @@
 
 import logging
 import os
+import re
 import threading
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -10,8 +11,9 @@ from pathlib import Path
 
 from service.errors import BundleError, StreetfixError
 from service.localization.localizer import Localizer
-from service.maps.manifest import TILES_FOLDER, Manifest, read_manifest
-from service.maps.tiles import open_map
+from service.maps.manifest import TILES_FOLDER, Manifest, Tile, read_manifest
+from service.maps.store.stored_map import StoredMap
+from service.maps.tiles import TileSource, open_map
 from service.runtime.map_registry import MapRegistry, Refused, bundle_paths, twin_error, version_of
 from service.runtime.serving_table import Key, MapVersion
 from service.runtime.wakeup import Wakeup
@@ -24,6 +26,31 @@ _POLL_S = 0.25
 #: For a worker that cannot open a version that serves in the others: seconds between two attempts, and the number of attempts after
 #: which it also tries unchanged files again.
 _RETRY_S, _ROUNDS_UNTIL_ANEW = 1.0, 30
+#: Address of a store in a message.
+_ADDRESS = re.compile(r"\b\w+://\S*")
+
+
+#: Stamp that no folder has.
+_NEVER: Stamp = (("", 0, 0),)
+
+
+class _LoggedTiles:
+    """Log why a tile cannot be fetched. The answer to the request does not say so, because the reason has addresses and folders."""
+
+    def __init__(self, tiles: TileSource) -> None:
+        self._tiles = tiles
+        self.has_failed = False
+
+    def expect(self, tiles: Sequence[Tile]) -> None:
+        self._tiles.expect(tiles)
+
+    def folder(self, tile: Tile) -> Path:
+        try:
+            return self._tiles.folder(tile)
+        except StreetfixError as error:
+            self.has_failed = True
+            _log.error("tile_not_fetched tile=%s reason=%s", tile.folder, error.message)
+            raise
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,11 +74,20 @@ class MapWatcher:
         paths: bundles, or folders of bundles, with which the service was started.
         warm: called with every new map before it serves, so that its first request is as fast as the next. If it raises, the map is
             refused for this reason.
+        stored: maps in object storage, with which the service was started. Their folders in the cache are folders of bundles.
     """
 
-    def __init__(self, registry: MapRegistry, paths: Sequence[Path], *, warm: Callable[[Localizer], None]) -> None:
+    def __init__(
+        self,
+        registry: MapRegistry,
+        paths: Sequence[Path],
+        *,
+        warm: Callable[[Localizer], None],
+        stored: Sequence[StoredMap] = (),
+    ) -> None:
         self._registry = registry
-        self._paths = tuple(paths)
+        self._stored = {each.folder: each for each in stored}
+        self._paths = (*paths, *self._stored)
         self._warm = warm
         self._stop, self._wakeup = threading.Event(), Wakeup()
         self._thread: threading.Thread | None = None
@@ -111,6 +147,7 @@ class MapWatcher:
         events = self._mount_new(bundles)
         if dropped := self._drop():
             events += dropped + self._mount_new(bundles)  # older versions may fit now
+        self._forget_stored()
         self._tell_refused()
         return events
 
@@ -186,12 +223,17 @@ class MapWatcher:
 
     def _mount(self, bundle: _Bundle) -> StreetfixError | None:
         """Open, warm up and mount a bundle; return the error if that fails."""
+        source, stamp = None, bundle.stamp
         try:
-            localizer = Localizer.open(open_map(bundle.path), provider=self._registry.provider)
+            if (stored := self._stored.get(bundle.path.parent)) is not None:
+                source = _LoggedTiles(stored.tiles(bundle.path))
+            localizer = Localizer.open(open_map(bundle.path, source=source), provider=self._registry.provider)
             self._warm(localizer)
             self._registry.mount(localizer)
         except StreetfixError as error:
-            return self._refuse(bundle.path, bundle.stamp, error)
+            if source is not None and source.has_failed:  # the store may answer again, so the next scan tries again
+                stamp = _NEVER
+            return self._refuse(bundle.path, stamp, error)
         except Exception as error:  # any defect refuses only this bundle; the others are still processed
             _log.exception("map_failed path=%s", bundle.path)
             what = f"{bundle.path}: cannot be opened ({type(error).__name__}); see the log of the service"
@@ -212,6 +254,7 @@ class MapWatcher:
     def _bundles(self) -> list[_Bundle]:
         """Return the bundles that are in the folders now."""
         found = []
+        self._refresh_stored()
         present = self._present()
         self._manifests = {path: known for path, known in self._manifests.items() if path in present}
         for path in present:
@@ -232,6 +275,9 @@ class MapWatcher:
     def _present(self) -> list[Path]:
         found: list[Path] = []
         for path in self._paths:
+            if path in self._stored:
+                found += self._stored[path].versions()
+                continue
             try:
                 found += bundle_paths(path)
                 if self._is_refused(path, ()):
@@ -242,6 +288,28 @@ class MapWatcher:
         for gone in set(self._failed) - set(found) - set(self._paths):
             del self._failed[gone]
         return found
+
+    def _refresh_stored(self) -> None:
+        """Ask the stores for new versions. If a store does not answer, the versions in the cache stay."""
+        for folder, stored in self._stored.items():
+            try:
+                stored.refresh()
+            except StreetfixError as error:
+                if not self._is_refused(folder, ()):
+                    self._refuse(folder, (), error)
+            else:
+                self._failed.pop(folder, None)
+
+    def _forget_stored(self) -> None:
+        """Delete versions in the cache that no worker has mounted or offers."""
+        table = self._registry.table.read()
+        known = [*(known.versions for known in table.maps.values()), *table.offers.values()]
+        keep = {version.version for versions in known for version in versions}
+        for folder, stored in self._stored.items():
+            try:
+                stored.forget(keep)
+            except StreetfixError as error:
+                _log.warning("map_cache_not_deleted path=%s reason=%s", folder, error.message)
 
     def _missing(self) -> set[Key]:
         """Return mounted versions whose folder is gone.
@@ -313,10 +381,10 @@ class MapWatcher:
     def _tell_refused(self) -> None:
         """Publish the refused bundles to the request handlers.
 
-        Only the name of the folder is shown, because a health probe needs no key.
+        Only the name of the folder is shown, and no address of a store, because a health probe needs no key.
         """
         self._registry.refused = tuple(
-            Refused(path.name or str(path), error.message.replace(f"{path.parent}{os.sep}", ""))
+            Refused(path.name or str(path), _ADDRESS.sub("...", error.message.replace(f"{path.parent}{os.sep}", "")))
             for path, (_, error) in sorted(self._failed.items())
         )
 

@@ -6,11 +6,13 @@ Later sources override earlier ones: defaults, TOML file, environment ``STREETFI
 import os
 import re
 import tomllib
+from collections.abc import Iterable
 from ipaddress import IPv4Address, IPv6Address, ip_address
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, SecretStr, ValidationError, field_validator, model_validator
+from pydantic_core import core_schema
 from pydantic_settings import (
     BaseSettings,
     NoDecode,
@@ -19,8 +21,9 @@ from pydantic_settings import (
     TomlConfigSettingsSource,
 )
 
-from service.errors import RequestError
+from service.errors import BundleError, RequestError
 from service.imaging.picture_headers import DEFAULT_LIMITS
+from service.maps.store.remote import checked_url, is_url
 from service.option_limits import FALSE_ACCEPT_RATE, LEAST_FALSE_ACCEPT_RATE
 from service.retrieval.encoder import Provider
 from service.runtime.environment import CLIENT_KEY, CONFIG, did_you_mean, require_known, setting_names
@@ -28,7 +31,31 @@ from service.runtime.readable import why_unreadable
 from service.runtime.seal import LEAST_KEY
 
 _LABEL = r"[a-z0-9_]([a-z0-9_-]{0,61}[a-z0-9_])?"
+#: A map in a list with colons: a URL, whose credentials are refused later, or a path.
+_MAP_PATTERN = re.compile(r"\w+://(?:[^/@]*@)?[^:]*|[^:]+")
 _HOST_PATTERN = re.compile(rf"\*|(\*\.)?{_LABEL}(\.{_LABEL})*")
+
+
+class MapUrl(str):
+    """URL of a map in object storage, such as ``s3://bucket/maps/town``.
+
+    Raises:
+        ValueError: the URL is not valid.
+    """
+
+    __slots__ = ()
+
+    def __new__(cls, text: str) -> "MapUrl":
+        """Check the URL."""
+        try:
+            return super().__new__(cls, checked_url(text))
+        except BundleError as error:  # pydantic reports it with the name of the setting
+            raise ValueError(error.message) from error
+
+    @classmethod
+    def __get_pydantic_core_schema__(cls, _source: object, _handler: object) -> core_schema.CoreSchema:
+        """Accept only instances; ``Settings`` makes them from texts."""
+        return core_schema.is_instance_schema(cls, serialization=core_schema.to_string_ser_schema())
 
 
 class Limits(BaseModel):
@@ -60,8 +87,18 @@ class Settings(BaseSettings):
         env_prefix="STREETFIX_", env_nested_delimiter="__", frozen=True, extra="forbid", cli_parse_args=False
     )
 
-    maps: Annotated[tuple[Path, ...], NoDecode] = Field(
-        (), description="map bundles, or folders of them, separated by ':'"
+    maps: Annotated[tuple[Path | MapUrl, ...], NoDecode] = Field(
+        (), description="map bundles, folders of them, or URLs of maps in object storage, separated by ':'"
+    )
+    tile_cache: Path | None = Field(
+        None,
+        description="folder for maps from object storage, which processes may share; default: streetfix/tiles in ~/.cache",
+    )
+    tile_cache_bytes: int = Field(
+        20_000_000_000,
+        ge=1_000_000,
+        le=2**60,
+        description="bound of the tiles in tile_cache; the least recently used ones are deleted",
     )
     strict: bool = Field(
         False,
@@ -185,7 +222,10 @@ class Settings(BaseSettings):
     @field_validator("maps", mode="before")
     @classmethod
     def _split(cls, value: object) -> object:
-        return tuple(part for part in value.split(":") if part) if isinstance(value, str) else value
+        given = _MAP_PATTERN.findall(value) if isinstance(value, str) else value
+        if not isinstance(given, Iterable):
+            return given
+        return tuple(MapUrl(each) if isinstance(each, str) and is_url(each) else each for each in given if each)
 
     @field_validator("allowed_hosts", mode="before")
     @classmethod
@@ -250,6 +290,8 @@ def load_settings(config: Path | None = None, **flags: object) -> Settings:
         where = ".".join(str(part) for part in first["loc"])
         if first["type"] == "extra_forbidden":
             what = f"setting {where}: there is no such setting{did_you_mean(where, setting_names(Settings))}; docs/serving.md lists them"
+        elif first["loc"][:1] == ("maps",):  # nor the credentials of a URL
+            what = f"setting maps: {first['msg'].removeprefix('Value error, ')}"
         elif where == "belief_key":  # a message must not show a secret
             what = f"setting belief_key: the value is not valid; give {LEAST_KEY} random characters or more, or leave it out"
         elif where:

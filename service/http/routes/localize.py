@@ -79,7 +79,7 @@ def router_for(runner: RequestRunner) -> APIRouter:
     async def ask(request: Request, work: Work) -> Response:
         async def answer(body: Body) -> Response:
             headers = request.headers
-            given = Given(
+            given = MultipartRequest(
                 body,
                 headers.get("content-type", ""),
                 request.state.request_id,
@@ -108,7 +108,7 @@ class BatchAnswer(BaseModel):
 
 
 @dataclass(frozen=True, slots=True)
-class Given:
+class MultipartRequest:
     """A complete body and what its request says.
 
     Attributes:
@@ -130,10 +130,10 @@ class Given:
         return self.body.split(self.content_type, max_parts=MOST_PARTS)
 
 
-Work = Callable[[Engine, Given], Awaitable[bytes]]
+Work = Callable[[Engine, MultipartRequest], Awaitable[bytes]]
 
 
-async def _single(engine: Engine, given: Given) -> bytes:
+async def _single(engine: Engine, given: MultipartRequest) -> bytes:
     def work() -> bytes:
         parts = given.parts()
         require_parts(parts, ("rgb", "depth", "request"))
@@ -143,7 +143,7 @@ async def _single(engine: Engine, given: Given) -> bytes:
     return await given.body.run(work)
 
 
-async def _sequence(engine: Engine, given: Given) -> bytes:
+async def _sequence(engine: Engine, given: MultipartRequest) -> bytes:
     def work() -> bytes:
         parts = given.parts()
         request = parsed(document_of(parts), schema.SequenceRequest)
@@ -153,7 +153,7 @@ async def _sequence(engine: Engine, given: Given) -> bytes:
     return await given.body.run(work)
 
 
-async def _batch(engine: Engine, given: Given) -> bytes:
+async def _batch(engine: Engine, given: MultipartRequest) -> bytes:
     """Answer a batch. Each request takes a worker as a single request does; one beyond the queue gets its own problem."""
 
     def split() -> list[tuple[schema.LocalizeRequest, bytes, bytes]]:
@@ -180,7 +180,7 @@ async def _batch(engine: Engine, given: Given) -> bytes:
     return BatchAnswer(outcomes=list(outcomes)).model_dump_json(by_alias=True).encode()
 
 
-def _written(located: Located, given: Given) -> bytes:
+def _written(located: Located, given: MultipartRequest) -> bytes:
     given.span.stages(located.answer.timings)
     answer = answer_from(located)
     if not given.geopose_alone:

@@ -6,7 +6,7 @@ import pytest
 
 from service.bridge.bridge import IDLE_S, Bridge, line_of
 from service.bridge.diagnostics import Level
-from service.bridge.gate import Gate
+from service.bridge.publish_policy import PublishPolicy
 from service.contract.schema import LocalizeAnswer
 from service.errors import RequestError, UnreachableError
 
@@ -88,7 +88,7 @@ def test_no_query_is_sent_without_a_pair(robot: Robot) -> None:
 
 
 def test_the_rate_is_limited_and_the_newest_pair_is_sent(robot: Robot) -> None:
-    bridge = robot.bridge(gate=Gate(rate_hz=1.0))
+    bridge = robot.bridge(policy=PublishPolicy(rate_hz=1.0))
     robot.see(bridge, 1 * S)
     assert bridge.step() is not None
     robot.see(bridge, 2 * S)
@@ -104,7 +104,7 @@ def test_the_rate_is_limited_and_the_newest_pair_is_sent(robot: Robot) -> None:
 
 
 def test_without_a_limit_every_pair_has_its_turn(robot: Robot) -> None:
-    bridge = robot.bridge(gate=Gate(rate_hz=0.0))
+    bridge = robot.bridge(policy=PublishPolicy(rate_hz=0.0))
     for second in (1, 2, 3):
         robot.see(bridge, second * S)
     stamps = []
@@ -115,22 +115,22 @@ def test_without_a_limit_every_pair_has_its_turn(robot: Robot) -> None:
 
 
 @pytest.mark.parametrize(
-    ("changed", "gate", "why"),
+    ("changed", "policy", "why"),
     [
-        ({"confidence": 0.9}, Gate(min_confidence=0.9), ""),
-        ({"confidence": 0.899}, Gate(min_confidence=0.9), "confidence 0.899 is below 0.9"),
-        ({"status": "AMBIGUOUS"}, Gate(min_confidence=0.0), "AMBIGUOUS"),
-        ({"status": "OUT_OF_MAP"}, Gate(min_confidence=0.0), "OUT_OF_MAP"),
-        ({"confidence": None}, Gate(min_confidence=0.1), "no confidence: the map is not calibrated"),
-        ({"confidence": None}, Gate(min_confidence=0.0), ""),
+        ({"confidence": 0.9}, PublishPolicy(min_confidence=0.9), ""),
+        ({"confidence": 0.899}, PublishPolicy(min_confidence=0.9), "confidence 0.899 is below 0.9"),
+        ({"status": "AMBIGUOUS"}, PublishPolicy(min_confidence=0.0), "AMBIGUOUS"),
+        ({"status": "OUT_OF_MAP"}, PublishPolicy(min_confidence=0.0), "OUT_OF_MAP"),
+        ({"confidence": None}, PublishPolicy(min_confidence=0.1), "no confidence: the map is not calibrated"),
+        ({"confidence": None}, PublishPolicy(min_confidence=0.0), ""),
     ],
 )
-def test_only_answers_that_pass_the_gate_are_published_and_the_rest_is_diagnosed(
-    robot: Robot, answer_of: Answer, changed: dict[str, Any], gate: Gate, why: str
+def test_only_answers_that_pass_the_policy_are_published_and_the_rest_is_diagnosed(
+    robot: Robot, answer_of: Answer, changed: dict[str, Any], policy: PublishPolicy, why: str
 ) -> None:
     robot.answer = answer_of(**changed)
-    bridge = robot.bridge(gate=gate)
-    gate._last_query_s = None
+    bridge = robot.bridge(policy=policy)
+    policy._last_query_s = None
     robot.see(bridge, 1 * S)
     published = bridge.step()
     assert published is not None
@@ -141,7 +141,7 @@ def test_only_answers_that_pass_the_gate_are_published_and_the_rest_is_diagnosed
 
 @pytest.mark.parametrize("error", [UnreachableError("nobody there"), RequestError("too dark")])
 def test_a_failed_query_is_reported_and_the_next_is_sent(robot: Robot, answer_of: Answer, error: Exception) -> None:
-    bridge = robot.bridge(gate=Gate(rate_hz=0.0))
+    bridge = robot.bridge(policy=PublishPolicy(rate_hz=0.0))
     robot.answer = error
     robot.see(bridge, 1 * S)
     published = bridge.step()
@@ -176,7 +176,7 @@ def test_silence_names_the_topics_that_bring_nothing(robot: Robot, info_of: Make
 
 
 def test_lines_for_people(robot: Robot, answer_of: Answer) -> None:
-    bridge = robot.bridge(gate=Gate(rate_hz=0.0))
+    bridge = robot.bridge(policy=PublishPolicy(rate_hz=0.0))
     lines = []
     for answer in (
         answer_of(),
@@ -200,4 +200,4 @@ def test_lines_for_people(robot: Robot, answer_of: Answer) -> None:
 )
 def test_a_gate_that_is_none_is_refused_with_its_option(wrong: dict[str, float]) -> None:
     with pytest.raises(RequestError, match=r"^--(rate|min-confidence): "):
-        Gate(**wrong)
+        PublishPolicy(**wrong)

@@ -33,7 +33,7 @@ def test_every_setting_reaches_the_bridge() -> None:
     with opened(settings) as bridge:
         assert bridge.topics == Topics("/c", "/d", "/i", "/p", "/g")
         assert (bridge.frame_id, bridge.rectified) == ("earth", True)
-        assert (bridge.gate.rate_hz, bridge.gate.min_confidence) == (0.5, 0.25)
+        assert (bridge.policy.rate_hz, bridge.policy.min_confidence) == (0.5, 0.25)
         assert bridge.pairs._tolerance_ns == 125_000_000
         np.testing.assert_array_equal(bridge.T_vehicle_camera[:3, 3], [1, 2, 3])
 

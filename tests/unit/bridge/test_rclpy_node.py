@@ -9,7 +9,7 @@ import pytest
 
 from service.bridge import rclpy_node
 from service.bridge.bridge import Bridge, Published
-from service.bridge.gate import Gate
+from service.bridge.publish_policy import PublishPolicy
 from service.contract.schema import LocalizeAnswer
 from service.errors import ExtraMissingError
 
@@ -19,7 +19,7 @@ S = 10**9
 def test_pictures_in_a_pose_and_a_diagnosis_out(
     ros: Any, image_of: Callable[..., Any], info_of: Callable[..., Any], answer_of: Callable[..., LocalizeAnswer]
 ) -> None:
-    bridge = Bridge(localize=lambda *_: answer_of(), gate=Gate(rate_hz=0.0), clock=lambda: 0.0)
+    bridge = Bridge(localize=lambda *_: answer_of(), policy=PublishPolicy(rate_hz=0.0), clock=lambda: 0.0)
     topics, told = bridge.topics, list[Published]()
 
     def see() -> None:
@@ -54,7 +54,7 @@ def test_image_subscriptions_follow_the_settings(
 
 def test_silence_is_reported_once_per_second(ros: Any) -> None:
     now_s = [0.0]
-    bridge = Bridge(localize=lambda *_: pytest.fail("asked"), gate=Gate(rate_hz=0.0), clock=lambda: now_s[0])
+    bridge = Bridge(localize=lambda *_: pytest.fail("asked"), policy=PublishPolicy(rate_hz=0.0), clock=lambda: now_s[0])
 
     def later() -> None:
         now_s[0] += 0.5

@@ -7,8 +7,8 @@ from pathlib import Path
 import pytest
 
 from service.bridge.bridge import Bridge, Topics
-from service.bridge.gate import Gate
 from service.bridge.pairs import Pairs
+from service.bridge.publish_policy import PublishPolicy
 from service.bridge.settings import BridgeSettings, about, parameters, settings_from
 from service.cli.bridge import ros2
 
@@ -25,10 +25,10 @@ def test_the_settings_are_the_options_of_the_command_with_their_defaults() -> No
 
 
 def test_the_defaults_are_those_of_the_bridge() -> None:
-    told, topics, gate = BridgeSettings(), Topics(), Gate()
+    told, topics, policy = BridgeSettings(), Topics(), PublishPolicy()
     assert (told.color_topic, told.depth_topic, told.info_topic) == (topics.color, topics.depth, topics.info)
     assert (told.pose_topic, told.diagnostics_topic) == (topics.pose, topics.diagnostics)
-    assert (told.rate, told.min_confidence) == (gate.rate_hz, gate.min_confidence)
+    assert (told.rate, told.min_confidence) == (policy.rate_hz, policy.min_confidence)
     assert told.tolerance == inspect.signature(Pairs).parameters["tolerance_s"].default
     bridge = inspect.signature(Bridge).parameters
     assert (told.frame, told.rectified) == (bridge["frame_id"].default, bridge["rectified"].default)

@@ -6,10 +6,14 @@ import pytest
 
 from model_training.calibration import elsewhere, rendered_rig
 from model_training.calibration.rendered_rig import RigFile, frames_of_rig, read_rig, render_query, surfels_in_view
+from model_training.cli.calibrate import part_for
 from service.errors import BundleError, DatasetError
 from service.geometry.rigid import R_BODY_OPTICAL, rotation_z, transform_from
 from service.localization.localizer import Localizer
 from service.maps.reader import MapBundle
+from service.maps.tiled_writer import write_tiled
+from service.maps.tiles import open_map
+from service.maps.writer import replace_calibration
 
 CAMERA = {"width": 64, "height": 48, "fx": 32.0, "fy": 32.0, "cx": 31.5, "cy": 23.5, "height_m": 1.5}
 STEREO = {"noise_px": 0.25, "baseline_m": 0.1, "min_range_m": 0.4, "max_range_m": 30.0}
@@ -172,3 +176,25 @@ def test_a_map_without_a_cloud_is_refused(bundle_path):
     bundle = replace(MapBundle.open(bundle_path), cloud=None)
     with pytest.raises(BundleError, match="has no cloud to render images from"):
         frames_of_rig(Localizer.open(bundle), rig_of())
+
+
+def test_a_tiled_map_is_calibrated_on_its_own_tiles(stock_map, small_dataset, tmp_path, monkeypatch):
+    """The whole map is one tile. It gives the same frames, and its new calibration keeps the tile."""
+    tiled = tmp_path / "tiled"
+    write_tiled(tiled, {(0, 0): stock_map}, 500.0, name="stock")
+    monkeypatch.setattr(elsewhere, "FEWEST_LEFT", 3)
+    monkeypatch.setattr(rendered_rig, "IMAGES", 4)
+    sensor = {"noise_share": 0.01, "min_range_m": 0.4, "max_range_m": 30.0}
+    rig = rig_of(sensor, width=96, height=72, fx=48.0, fy=48.0, cx=47.5, cy=35.5)
+    part = part_for(open_map(tiled), rig)
+    found, expected = (
+        frames_of_rig(Localizer.open(each), rig, workers=1) for each in (part, MapBundle.open(stock_map))
+    )
+    np.testing.assert_allclose(found.evidence, expected.evidence, rtol=1e-3, atol=1e-3)
+    document = json.loads((tiled / "calibration.json").read_text())
+    made = replace_calibration(tiled, {**document, "measured_on": {"changed": 1.0}})
+    again = open_map(tiled)
+    assert again.manifest.version == made.version
+    frame = next(iter(small_dataset.queries("drive1_precise")))
+    assert Localizer.open(again).localize(frame.query(again.grid)).candidates
+    assert part_for(again, small_dataset).T_map_place.shape == again.T_map_place.shape

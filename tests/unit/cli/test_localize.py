@@ -445,6 +445,16 @@ def test_a_folder_given_as_the_name_of_a_map_is_named(
         localize("http://x", **files, map_name="no-folder")
 
 
+def test_a_folder_given_as_the_name_of_a_map_is_named_if_no_service_answers(
+    files: dict[str, Any], bundle_path: Path
+) -> None:
+    with pytest.raises(RequestError) as caught:
+        localize("http://127.0.0.1:1", **files, map_name=str(bundle_path))
+    folder, service = caught.value.message.split("\n")
+    assert folder == f"--map: {bundle_path} is the folder of a map bundle; give the name of the map: --map tiny"
+    assert "no service answers" in service
+
+
 @pytest.mark.parametrize(
     ("in_file", "given", "sent"),
     [

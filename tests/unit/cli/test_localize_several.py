@@ -323,8 +323,11 @@ def test_a_file_that_is_missing_is_named_with_its_option(run: Any, tmp_path: Pat
 @pytest.mark.parametrize(
     ("arguments", "told"),
     [
-        ([], "missing --rgb, --depth, --camera; or give --sequence FILE or --batch FILE"),
-        (["--rgb", "a", "--camera", "c"], "missing --depth;"),
+        (
+            [],
+            "missing --rgb, --depth, --camera (every query needs a depth image of the same moment); or give --sequence",
+        ),
+        (["--rgb", "a", "--camera", "c"], "missing --depth (every query needs a depth image"),
         (["--sequence", "a", "--batch", "b"], "--sequence and --batch exclude each other"),
         (["--sequence", "a", "--rgb", "b"], "--rgb and --sequence exclude each other"),
         (["--batch", "a", "--camera", "b"], "--camera and --batch exclude each other"),

@@ -173,6 +173,7 @@ def test_the_parts_are_what_the_contract_asks_for(ask: Asking, answer_json: Json
     parts = parts_of(seen[0])
     document = json.loads(parts["request"])
     assert (seen[0].method, seen[0].url.path, seen[0].headers["authorization"]) == ("POST", "/v1/localize", "Bearer k")
+    assert len(seen[0].headers["x-streetfix-cell"]) >= 8  # any cell: the query has no prior
     assert (parts["rgb"][:2], parts["depth"][:4]) == (b"\xff\xd8", b"SFD1")
     assert document["map"] == "tiny"
     assert document["gravity"] == {"x": 0, "y": 1, "z": 0}

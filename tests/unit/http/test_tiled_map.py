@@ -146,5 +146,5 @@ def test_a_tile_that_vanished_is_a_clear_error(
     engine.close()
     assert response.status_code == 503
     problem = json.dumps(response.json())
-    assert "cannot be read" in problem
+    assert "manifest.json is missing" in problem
     assert str(tmp_path) not in problem

@@ -283,7 +283,9 @@ def test_a_truncated_file_is_refused(half_maps, tmp_path):
 
 
 def test_the_manifest_is_of_the_same_format(merged):
-    assert json.loads((merged.path / "manifest.json").read_text()).keys() == json.loads(merged.manifest.to_bytes()).keys()
+    assert (
+        json.loads((merged.path / "manifest.json").read_text()).keys() == json.loads(merged.manifest.to_bytes()).keys()
+    )
 
 
 def test_brightness_of_a_merged_map_is_that_of_both_surveys(merged, whole):

@@ -123,6 +123,25 @@ def test_a_prior_opens_only_its_own_tile(tiled: TiledMap, small_dataset: Any) ->
     assert again.tiles.opened == (0,)
 
 
+def test_closed_tiles_near_a_camera_are_expected_once(tiled_path: Path) -> None:
+    class Source(LocalTiles):
+        def expect(self, tiles: Any) -> None:
+            asked.append([(tile.column, tile.row) for tile in tiles])
+
+    asked: list[list[tuple[int, int]]] = []
+    opened = TiledMap.open(tiled_path, source=Source(tiled_path))
+    numbers = [(tile.column, tile.row) for tile in opened.manifest.tiles]
+    middle = opened.tiles.squares_m[0].reshape(2, 2).mean(axis=0)
+    for _ in range(2):
+        opened.tiles.expect_around(middle)
+    assert len(asked) == 1
+    assert sorted(asked[0]) == sorted(numbers[1:])  # that of the camera is opened anyway
+    opened.tiles.get(1)
+    opened.tiles.expect_around(middle)
+    opened.tiles.expect_around(middle + 1e6)
+    assert asked[1:] == ([[n for n in asked[0] if n != numbers[1]]] if len(numbers) > 2 else [])
+
+
 def test_tiles_are_closed_beyond_the_limit(tiled_path: Path, small_dataset: Any) -> None:
     small, large = TiledMap.open(tiled_path, open_bytes=1), TiledMap.open(tiled_path)
     for query in queries_of(small_dataset, large):
@@ -180,7 +199,7 @@ def test_the_search_index_chooses_the_tiles_of_a_large_map(
     assert beside.T_map_place[:, 0, 3].tolist() == [10.0] * 12 + [60.0] * 12
 
 
-@pytest.mark.parametrize("name", ["descriptors.npy", "cloud/surfels.npy", "manifest.json"])
+@pytest.mark.parametrize("name", ["descriptors.npy", "cloud/surfels.npy"])
 def test_a_damaged_tile_is_refused_when_it_opens(tiled_copy: Path, name: str) -> None:
     opened = TiledMap.open(tiled_copy)
     tile = tiled_copy / opened.manifest.tiles[0].folder / name
@@ -192,10 +211,19 @@ def test_a_damaged_tile_is_refused_when_it_opens(tiled_copy: Path, name: str) ->
     opened.tiles.get(1)
 
 
+def test_another_bundle_in_the_folder_of_a_tile_is_refused(tiled_copy: Path) -> None:
+    opened = TiledMap.open(tiled_copy)
+    one, other = (tiled_copy / tile.folder for tile in opened.manifest.tiles[:2])
+    shutil.rmtree(one)
+    shutil.copytree(other, one)
+    with pytest.raises(BundleError, match=f"version {other.name}, but the map lists {one.name}"):
+        opened.tiles.get(0)
+
+
 def test_a_missing_tile_is_refused_when_it_opens(tiled_copy: Path) -> None:
     opened = TiledMap.open(tiled_copy)
     shutil.rmtree(tiled_copy / opened.manifest.tiles[1].folder)
-    with pytest.raises(BundleError, match=r"manifest.json: cannot be read"):
+    with pytest.raises(BundleError, match=r"not a map bundle: manifest.json is missing"):
         opened.tiles.get(1)
 
 

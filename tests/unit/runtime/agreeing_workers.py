@@ -37,7 +37,7 @@ def manifest_of(path: Path) -> Any:
     return SimpleNamespace(name="m", version=f"v{number}", made_at=datetime.fromtimestamp(number, UTC))
 
 
-def opened(path: Path) -> Any:
+def opened(path: Path, **_: object) -> Any:
     _CHANCE.seed()
     time.sleep(_CHANCE.uniform(0, 0.02))
     if (path / "damaged").exists() or not path.exists():

@@ -286,7 +286,7 @@ def test_only_the_newest_three_versions_are_opened(
     for seed in range(1, 5):
         watched.write(f"v{seed}", seed=seed)
     opened: list[str] = []
-    monkeypatch.setattr(map_watcher, "open_map", lambda path: opened.append(path.name) or open_map(path))
+    monkeypatch.setattr(map_watcher, "open_map", lambda path, **how: opened.append(path.name) or open_map(path, **how))
     registry = MapRegistry()
     watcher = MapWatcher(registry, [watched.folder], warm=watched.warm)
     with caplog.at_level("INFO"):

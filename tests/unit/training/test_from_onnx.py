@@ -6,12 +6,12 @@ import pytest
 
 torch = pytest.importorskip("torch", reason="needs the extra `training`")
 
-from model_training.training.draws import augmented_batches  # noqa: E402  # after the skip
 from model_training.training.encoder_net import EncoderNet, EncoderShape  # noqa: E402
 from model_training.training.export import export  # noqa: E402
 from model_training.training.from_onnx import net_of  # noqa: E402
 from model_training.training.loop import TrainingConfig, load_run, read_packs, train  # noqa: E402
 from model_training.training.quantise import Views, quantise  # noqa: E402
+from model_training.training.sampling import augmented_batches  # noqa: E402  # after the skip
 from service.errors import DatasetError, EncoderError  # noqa: E402
 from service.retrieval.encoder import Encoder  # noqa: E402
 

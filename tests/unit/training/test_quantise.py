@@ -8,11 +8,11 @@ torch = pytest.importorskip("torch", reason="needs the extra `training`")
 
 from model_training.cli import quantize as cli  # noqa: E402  # after the skip
 from model_training.training import quantise as module  # noqa: E402
-from model_training.training.draws import augmented_batches  # noqa: E402
 from model_training.training.encoder_net import EncoderNet  # noqa: E402
 from model_training.training.export import export  # noqa: E402
 from model_training.training.loop import TrainingConfig  # noqa: E402
 from model_training.training.quantise import Views, quantise  # noqa: E402
+from model_training.training.sampling import augmented_batches  # noqa: E402
 from service.errors import EncoderError  # noqa: E402
 from service.retrieval.encoder import Encoder  # noqa: E402
 

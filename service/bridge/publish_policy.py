@@ -7,7 +7,7 @@ from service.errors import RequestError
 
 
 @dataclass(slots=True)
-class Gate:
+class PublishPolicy:
     """Limits on the rate of queries and on the confidence of published answers. Only LOCALIZED answers are published.
 
     Attributes:

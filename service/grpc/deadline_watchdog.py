@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
 
-class Patience:
+class DeadlineWatchdog:
     """Watchdog that calls a function when a wait takes too long. It checks every 0.25 s."""
 
     def __init__(self) -> None:
@@ -14,7 +14,7 @@ class Patience:
         self._until: dict[int, tuple[float, Callable[[], object]]] = {}
         self._next = 0
         self._stop = threading.Event()
-        self._thread = threading.Thread(target=self._run, name="streetfix-patience", daemon=True)
+        self._thread = threading.Thread(target=self._run, name="streetfix-deadlines", daemon=True)
 
     def start(self) -> None:
         """Start the thread."""

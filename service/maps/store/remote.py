@@ -1,0 +1,266 @@
+"""The objects below a URL, through ``obstore``. Errors name the URL of the object and the remedy, and no credential."""
+
+import hashlib
+import os
+import re
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from datetime import timedelta
+from pathlib import Path
+from typing import TYPE_CHECKING, BinaryIO
+from urllib.parse import urlsplit
+
+from service.errors import BundleError, extra_missing
+from service.maps.manifest import FILE, FileEntry
+
+if TYPE_CHECKING:
+    from obstore.store import ObjectStore
+
+#: Schemes of the URLs of maps.
+SCHEMES = ("s3", "gs", "az", "file")
+#: Largest object that ``Remote.read`` returns: the manifest of a map of 500,000 tiles.
+MOST_READ_BYTES = 256 * 2**20
+#: Bytes of an object that are in memory at once.
+_CHUNK = 4 * 2**20
+#: Parts of one object that are uploaded at once, 5 MiB each.
+_PARTS = 4
+#: A request is sent again after errors of the transport and of the server, for at most this long.
+_RETRIES = 6
+_RETRY_FOR, _FIRST_PAUSE, _LONGEST_PAUSE = timedelta(seconds=30), timedelta(milliseconds=100), timedelta(seconds=5)
+#: A whole object may take long, but the connection and each piece may not.
+_CLIENT = {"connect_timeout": "5s", "read_timeout": "30s", "timeout": "6h"}
+#: Variable of each scheme that allows an endpoint without TLS, and what obstore tells otherwise.
+_ALLOW_HTTP = {"s3": "AWS_ALLOW_HTTP", "gs": "GOOGLE_ALLOW_HTTP", "az": "AZURE_ALLOW_HTTP"}
+_NO_HTTP = "builder error"
+#: Query of an address in an error. The signature of Azure is in there.
+_QUERY = re.compile(r"\?\S*")
+_STATUS = re.compile(r"status code: (\d{3}[^:\n]*)")
+_CODE = re.compile(r"<Code>(\w{1,64})</Code>")
+
+
+def is_url(text: str) -> bool:
+    """Return whether a text is the URL of a map, and not a path.
+
+    Args:
+        text: of a setting or of the command line.
+    """
+    return "://" in text
+
+
+def checked_url(text: str) -> str:
+    """Return the URL of a map without a final slash.
+
+    Args:
+        text: the URL, such as ``s3://bucket/maps/town``.
+
+    Raises:
+        BundleError: another scheme, no bucket or path, or a URL with credentials, a query or a fragment. The message repeats none of
+            these.
+    """
+    try:
+        parts = urlsplit(text)
+        if "@" in parts.netloc:
+            raise _wrong_url(parts.scheme, "has credentials; give them in environment variables (docs/operate.md)")
+    except ValueError as error:
+        raise _wrong_url(text.partition("://")[0], "is not valid; write s3://BUCKET/PATH") from error
+    if parts.scheme not in SCHEMES:
+        known = ", ".join(f"{each}://" for each in SCHEMES)
+        raise _wrong_url(parts.scheme, f"has no scheme of a store; write one of {known}")
+    if parts.query or parts.fragment:
+        raise _wrong_url(parts.scheme, "has a '?' or '#'; write only bucket and path")
+    if parts.scheme == "file" and (parts.netloc or not parts.path.strip("/")):
+        raise _wrong_url(parts.scheme, "names no folder; write three slashes, as in file:///srv/maps/town")
+    if parts.scheme != "file" and not parts.netloc:
+        raise _wrong_url(parts.scheme, "names no bucket; write s3://BUCKET/PATH")
+    return text.rstrip("/")
+
+
+def _scheme_of(url: str) -> str:
+    return url.partition(":")[0]
+
+
+def _wrong_url(scheme: str, what: str) -> BundleError:
+    return BundleError(f"the URL {scheme}://... of a map {what}", field="maps")
+
+
+class Remote:
+    """The objects below a URL. Threads may share it. A process must open its own one after ``fork``.
+
+    Args:
+        url: as ``checked_url`` returns it.
+        store: opened for this URL.
+
+    Attributes:
+        url: as given.
+    """
+
+    def __init__(self, url: str, store: "ObjectStore") -> None:
+        self.url = url
+        self._store = store
+
+    @classmethod
+    def open(cls, url: str, *, create: bool = False) -> "Remote":
+        """Open a store. Only for ``file://`` does this look at the store.
+
+        Credentials, region and endpoint come from the environment, as obstore documents: ``AWS_ACCESS_KEY_ID``, ``AWS_ENDPOINT_URL``,
+        ``GOOGLE_APPLICATION_CREDENTIALS``, ``AZURE_STORAGE_ACCOUNT_NAME`` and others.
+
+        Args:
+            url: URL of a map.
+            create: create the folder of a ``file://`` URL.
+
+        Raises:
+            BundleError: the URL or the configuration of the store is not valid, or the folder is missing.
+            ExtraMissingError: obstore is not installed.
+        """
+        url = checked_url(url)
+        try:
+            from obstore.exceptions import BaseError
+            from obstore.store import LocalStore, from_url
+        except ModuleNotFoundError as error:
+            raise extra_missing(f"{url}: a map in object storage", "store", error) from error
+        try:
+            if url.startswith("file://"):
+                return cls(url, LocalStore.from_url(url, mkdir=create))
+            retry = {
+                "max_retries": _RETRIES,
+                "retry_timeout": _RETRY_FOR,
+                "backoff": {"init_backoff": _FIRST_PAUSE, "max_backoff": _LONGEST_PAUSE, "base": 2},
+            }
+            # obstore reads this variable itself, but not beside other options of the client.
+            allow_http = os.environ.get(_ALLOW_HTTP[_scheme_of(url)], "").lower() in ("1", "true")
+            client = {**_CLIENT, "allow_http": allow_http}
+            return cls(url, from_url(url, client_options=client, retry_config=retry))  # type: ignore[call-overload]
+        except (BaseError, ValueError, OSError) as error:
+            raise _failed(url, "cannot be opened", error) from error
+
+    def read(self, name: str, *, unless: str | None = None) -> tuple[bytes, str | None] | None:
+        """Read a small object.
+
+        Args:
+            name: path below the URL.
+            unless: ETag of the content that the caller has; None reads in any case.
+
+        Returns:
+            The content and its ETag. None if the content still has the ETag ``unless``.
+
+        Raises:
+            BundleError: the object is missing, cannot be read, or is larger than ``MOST_READ_BYTES``.
+        """
+        from obstore.exceptions import NotModifiedError
+
+        with self._telling(name):
+            try:
+                found = self._store.get(name, options={"if_none_match": unless} if unless else None)
+            except NotModifiedError:
+                return None
+            if found.meta["size"] > MOST_READ_BYTES:
+                raise BundleError(
+                    f"{self.url}/{name}: {found.meta['size']} bytes, more than {MOST_READ_BYTES}; push the map again",
+                    field=name,
+                )
+            return bytes(found.bytes()), found.meta["e_tag"]
+
+    def read_if_there(self, name: str) -> bytes | None:
+        """Read a small object; return None if it is missing.
+
+        Args:
+            name: path below the URL.
+
+        Raises:
+            BundleError: the object cannot be read.
+        """
+        try:
+            found = self.read(name)
+        except BundleError as error:
+            if isinstance(error.__cause__, FileNotFoundError):
+                return None
+            raise
+        return None if found is None else found[0]
+
+    def save(self, name: str, entry: FileEntry, target: BinaryIO, *, told: Callable[[int], object]) -> None:
+        """Stream an object into an open file, and check its size and hash.
+
+        Args:
+            name: path below the URL.
+            entry: expected size and hash. Nothing is written if the store announces another size.
+            target: open for writing.
+            told: called with the number of bytes of each piece. It may raise to end the transfer.
+
+        Raises:
+            BundleError: the object is missing, cannot be read, or has another size or hash.
+            OSError: the file cannot be written.
+        """
+        with self._telling(name):
+            try:
+                found = self._store.get(name)
+            except FileNotFoundError as error:
+                raise self._damaged(name, "is missing in the store") from error
+            chunks = iter(found.stream(min_chunk_size=_CHUNK))
+        if (size := found.meta["size"]) != entry.size:
+            raise self._damaged(name, f"{size} bytes instead of {entry.size}")
+        digest, read = hashlib.sha256(), 0
+        while True:
+            with self._telling(name):
+                chunk = next(chunks, None)
+            if chunk is None:
+                break
+            read += len(chunk)
+            if read > entry.size:
+                break
+            digest.update(chunk)
+            target.write(chunk)
+            told(len(chunk))
+        if read != entry.size:
+            raise self._damaged(name, f"{read} bytes instead of {entry.size}")
+        if digest.hexdigest() != entry.sha256:
+            raise self._damaged(name, "the hash does not match the manifest")
+
+    def put(self, name: str, content: bytes | Path) -> None:
+        """Store an object. Readers see the whole object or the one before.
+
+        Args:
+            name: path below the URL.
+            content: the bytes, or the file that has them.
+
+        Raises:
+            BundleError: the object cannot be stored.
+        """
+        with self._telling(name, "cannot be written"):
+            self._store.put(name, content, max_concurrency=_PARTS)
+
+    def _damaged(self, name: str, what: str) -> BundleError:
+        # Only without this manifest does ``push`` store the files again.
+        beside = f"{name.rpartition('/cloud/')[0] or name.rpartition('/')[0]}/{FILE}".lstrip("/")
+        return BundleError(
+            f"{self.url}/{name}: {what}; delete {beside} in the store and push the map again (streetfix map push)",
+            field=name,
+        )
+
+    @contextmanager
+    def _telling(self, name: str, what: str = "cannot be read") -> Iterator[None]:
+        """Turn errors of the store inside the context into errors that name the object."""
+        from obstore.exceptions import BaseError
+
+        try:
+            yield
+        except FileNotFoundError as error:
+            told = "is missing in the store" if what == "cannot be read" else f"{what} (404: no such bucket)"
+            remedy = "check the URL, or push the map (streetfix map push)"
+            raise BundleError(f"{self.url}/{name} {told}; {remedy}", field=name) from error
+        except (BaseError, OSError, ValueError) as error:
+            raise _failed(f"{self.url}/{name}", what, error) from error
+
+
+def _failed(url: str, what: str, error: Exception) -> BundleError:
+    """Return the error for a failure of the store. Its text has no query, no body of an answer and no header."""
+    whole = str(error)
+    line = _QUERY.sub("", whole.partition("\n")[0])
+    if (status := _STATUS.search(line)) is not None:
+        code = _CODE.search(whole)
+        line = f"status {status[1].strip()}" + (f", {code[1]}" if code else "")
+    if _NO_HTTP in line and _scheme_of(url) in _ALLOW_HTTP:
+        remedy = f"for an endpoint without TLS set {_ALLOW_HTTP[_scheme_of(url)]}=true"
+    else:
+        remedy = "check the URL, the endpoint, the network and the credentials (docs/operate.md)"
+    return BundleError(f"{url} {what} ({line[:300]}); {remedy}", field=url.rpartition("/")[2])

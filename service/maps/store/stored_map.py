@@ -1,0 +1,187 @@
+"""A map in object storage as a folder on the disk, whose tiles appear on demand."""
+
+import hashlib
+import os
+import re
+import threading
+from collections import deque
+from collections.abc import Collection, Mapping, Sequence
+from contextlib import suppress
+from functools import partial
+from pathlib import Path
+
+from service.errors import BundleError
+from service.maps.content import NOT_SERVED
+from service.maps.manifest import FILE, Manifest, Tile, parsed_manifest, read_manifest
+from service.maps.store.cache import TileCache, is_used_now
+from service.maps.store.fetch import fetch_files, shared_files, shared_prefix, tile_manifest
+from service.maps.store.remote import Remote, checked_url
+
+_UNUSUAL = re.compile(r"[^A-Za-z0-9._-]+")
+
+
+class StoredMap:
+    """A map under a URL, and its folder in the cache. Threads and processes may share the cache.
+
+    ``folder`` has a folder for each version of the map, with ``manifest.json`` and the shared files. Its folder ``tiles`` has the tiles
+    that ``StoreTiles`` has fetched. All versions share them. A map without tiles is fetched whole. Files that the service does not read
+    are left out.
+
+    Args:
+        url: such as ``s3://bucket/maps/town``.
+        cache: the cache.
+
+    Attributes:
+        url: as given, without a final slash.
+        folder: folder of the map in the cache.
+
+    Raises:
+        BundleError: the URL is not valid.
+    """
+
+    def __init__(self, url: str, cache: TileCache) -> None:
+        self.url = checked_url(url)
+        self._cache = cache
+        key = hashlib.sha256(self.url.encode()).hexdigest()[:12]
+        self.folder = cache.folder / f"{_UNUSUAL.sub('_', self.url.rpartition('/')[2])[:64]}-{key}"
+        self._remote: Remote | None = None
+        self._etag: str | None = None
+        self._version: str | None = None
+
+    def refresh(self) -> None:
+        """Fetch the shared files of the current version, unless the cache has them.
+
+        The store is asked for the manifest only if it has changed since the last call.
+
+        Raises:
+            BundleError: the store cannot be read, a file is damaged, or the cache cannot be used.
+            ExtraMissingError: obstore is not installed.
+        """
+        remote = self._opened()
+        found = remote.read(FILE, unless=self._etag)
+        if found is None:
+            return
+        data, etag = found
+        manifest = parsed_manifest(data, f"{self.url}/{FILE}")
+        target = self.folder / manifest.version
+        self._cache.once(target, partial(self._fetch_version, manifest, data))
+        with self._cache.telling():
+            if (target / FILE).read_bytes() != data:  # the same content, built again
+                newer = target / f".{FILE}.{os.getpid()}"
+                newer.write_bytes(data)
+                newer.replace(target / FILE)
+        self._etag, self._version = etag, manifest.version
+
+    def versions(self) -> list[Path]:
+        """Return the folders of the versions in the cache."""
+        return sorted(each.parent for each in self.folder.glob(f"[!.]*/{FILE}"))
+
+    def tiles(self, version: Path) -> "StoreTiles":
+        """Return the source of the tiles of a version.
+
+        Args:
+            version: folder of the version, in ``folder``.
+        """
+        return StoreTiles(self._opened(), self._cache, version)
+
+    def forget(self, keep: Collection[str]) -> None:
+        """Delete the folders of other versions than these and the current one. The bound of the cache deletes their tiles.
+
+        Args:
+            keep: versions.
+        """
+        if self._version is None:
+            return
+        for each in self.versions():
+            if each.name not in {*keep, self._version}:
+                self._cache.delete(each)
+
+    def _opened(self) -> Remote:
+        if self._remote is None:
+            self._remote = Remote.open(self.url)
+        return self._remote
+
+    def _fetch_version(self, manifest: Manifest, data: bytes, into: Path) -> None:
+        remote = self._opened()
+        files = shared_files(manifest, f"{self.url}/{FILE}", leave_out=NOT_SERVED)
+        fetch_files(remote, shared_prefix(remote, manifest), files, into)
+        (into / FILE).write_bytes(data)
+
+
+class StoreTiles:
+    """The tiles of a map in object storage: a source of folders (``TileSource``). Threads may share it.
+
+    Args:
+        remote: the store of the map.
+        cache: the cache.
+        version: folder of a version of the map in the cache.
+    """
+
+    def __init__(self, remote: Remote, cache: TileCache, version: Path) -> None:
+        self._remote, self._cache, self._version = remote, cache, version
+        self._expected = deque[Tile]()
+        self._expecting = threading.Lock()
+        self._fetches_ahead = False
+        self._shared: Mapping[str, Path] | None = None
+
+    def folder(self, tile: Tile) -> Path:
+        """Return the folder with the bundle of a tile; fetch it unless the cache has it.
+
+        The bundle lacks the files that the service does not read. The bound of the cache may delete the folder later. Open files stay
+        readable. If the folder is gone before it was opened, ask again.
+
+        Args:
+            tile: of the map's manifest.
+
+        Raises:
+            BundleError: the store cannot be read, a file is damaged, or the cache cannot be used.
+        """
+        folder = self._version.parent / tile.folder
+        if not is_used_now(folder):
+            self._cache.once(folder, partial(self._fetch, tile))
+        return folder
+
+    def expect(self, tiles: Sequence[Tile]) -> None:
+        """Fetch tiles in the background, one after the other.
+
+        Args:
+            tiles: the most probable first. Those of the call before that are not fetched yet are forgotten.
+        """
+        with self._expecting:
+            self._expected = deque(tiles)
+            if self._fetches_ahead:
+                return
+            self._fetches_ahead = True
+        threading.Thread(target=self._fetch_ahead, name="fetch tiles ahead", daemon=True).start()
+
+    def _fetch_ahead(self) -> None:
+        while True:
+            with self._expecting:
+                if not self._expected:
+                    self._fetches_ahead = False
+                    return
+                tile = self._expected.popleft()
+            with suppress(BundleError):  # the request that needs the tile fetches it again, and says what is wrong
+                self.folder(tile)
+
+    def _fetch(self, tile: Tile, into: Path) -> None:
+        manifest, data = tile_manifest(self._remote, tile)
+        files = {name: entry for name, entry in manifest.files.items() if name not in NOT_SERVED}
+        shared = self._shared_by_hash()
+        for name in [name for name, entry in files.items() if entry.sha256 in shared]:
+            with suppress(OSError):  # a file system without hard links, or the version is being removed: fetch the file
+                (into / name).parent.mkdir(parents=True, exist_ok=True)
+                os.link(shared[files[name].sha256], into / name)
+                del files[name]
+        self._cache.reserve(into, {name: entry.size for name, entry in files.items()})
+        fetch_files(self._remote, f"{tile.folder}/", files, into)
+        (into / FILE).write_bytes(data)
+
+    def _shared_by_hash(self) -> Mapping[str, Path]:
+        """Return the shared files of the map by their hash. A tile has copies of some, which are hard links in the cache."""
+        if self._shared is None:
+            manifest = read_manifest(self._version)
+            self._shared = {
+                entry.sha256: self._version / name for name, entry in manifest.files.items() if name not in NOT_SERVED
+            }
+        return self._shared
