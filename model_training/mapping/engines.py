@@ -26,7 +26,7 @@ from service.errors import BundleError, DatasetError, StreetfixError, extra_miss
 Engine = Literal["local", "ray"]
 ENGINES: tuple[Engine, ...] = get_args(Engine)
 #: Memory of a process that builds a tile: a part for the programs, and a part for each scan, bytes (decision 0161).
-PROCESS_BYTES, SCAN_BYTES = 500 << 20, 600 << 10
+PROCESS_BYTES, SCAN_BYTES = 300 << 20, 900 << 10
 #: How often a tile is started before the build gives up, if the process that builds it dies: on this machine, and with Ray, whose
 #: machines may be taken away.
 LOCAL_ATTEMPTS, RAY_ATTEMPTS = 2, 4
