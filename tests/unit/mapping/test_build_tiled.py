@@ -14,7 +14,9 @@ from functools import partial
 
 import numpy as np
 import pytest
+import typer
 
+from model_training.cli.build_map import command
 from model_training.datasets.dataset import Dataset
 from model_training.datasets.survey_part import SurveyPart
 from model_training.mapping import build_tiled as driver
@@ -414,3 +416,11 @@ def test_free_memory_is_that_of_the_machine_or_of_the_control_group(tmp_path):
 def test_the_default_engine_needs_nothing():
     require_engine("local", None)
     require_engine("local", 3)
+
+
+@pytest.mark.parametrize("option", [{"workers": 2}, {"engine": "local"}])
+def test_options_of_tiles_without_an_edge_are_refused(small_dataset, option, tmp_path):
+    with pytest.raises(typer.BadParameter, match="it builds tiles; give --tile-m too") as refused:
+        command(small_dataset.folder, tmp_path / "m", **option)
+    assert refused.value.param_hint == f"--{next(iter(option))}"
+    assert list(tmp_path.iterdir()) == []
