@@ -39,7 +39,7 @@ def built_rows(report: Report, runs: Runs) -> None:
         report: collects the rows.
         runs: simulates the cities, or reuses them.
     """
-    _killed(report, runs.dataset(_plan("killed-tiles", 60, (100.0, 100.0), ("1", "2"))), runs.work / "tiles")
+    _killed(report, runs.dataset(_plan("killed-tiles", 60, (60.0, 60.0), ("1",))), runs.work / "tiles")
     _against_ray(report, runs.dataset(_plan("timed-tiles", 61, (150.0, 150.0), ())), runs.work / "tiles")
 
 
@@ -114,6 +114,7 @@ def _against_ray(report: Report, dataset: Dataset, work: Path) -> None:
         report.absent(row_id, BARRED[row_id], 'needs Ray: pip install ".[ray]"')
         return
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
+    os.environ.setdefault("RAY_worker_niceness", "0")  # as that of the processes
     import ray
 
     cores = len(os.sched_getaffinity(0))

@@ -239,7 +239,7 @@ def describe(manifest: Manifest) -> str:
     """
     counts, recall = manifest.counts, manifest.parameters.get(inverted_file.RECALL)
     search = "" if recall is None else f", search index with recall@10 of {recall:.3f} against exact search"
-    tiles = "" if manifest.tile_m is None else f", {len(manifest.tiles)} tiles of {manifest.tile_m:g} m"
+    tiles = "" if manifest.tile_m is None else f", tiles of {manifest.tile_m:g} m: {len(manifest.tiles)}"
     return (
         f"map {manifest.name}, version {manifest.version}: {counts.places} places, {counts.views} views, "
         f"{counts.cloud_points} cloud points, {counts.streets} street classes{search}{tiles}"

@@ -26,7 +26,7 @@ from service.errors import BundleError, DatasetError, StreetfixError, extra_miss
 Engine = Literal["local", "ray"]
 ENGINES: tuple[Engine, ...] = get_args(Engine)
 #: Memory of a process that builds a tile: a part for the programs, and a part for each scan, bytes (decision 0161).
-PROCESS_BYTES, SCAN_BYTES = 500 << 20, 600 << 10
+PROCESS_BYTES, SCAN_BYTES = 300 << 20, 900 << 10
 #: How often a tile is started before the build gives up, if the process that builds it dies: on this machine, and with Ray, whose
 #: machines may be taken away.
 LOCAL_ATTEMPTS, RAY_ATTEMPTS = 2, 4
@@ -291,6 +291,9 @@ def _run_ray(
             ray.init(address=address, log_to_driver=False)
         else:
             workers = workers or usual_workers(tasks)
+            os.environ.setdefault(
+                "RAY_worker_niceness", "0"
+            )  # Ray's default of 15 would let every other program go first
             ray.init(address="local", num_cpus=workers, include_dashboard=False, log_to_driver=False)
     pending: dict[Any, tuple[int, int]] = {}
     try:

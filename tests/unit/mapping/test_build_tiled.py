@@ -154,7 +154,7 @@ def test_a_survey_of_one_square_gives_a_tiled_map_of_one_tile(small_dataset, enc
 
     made = build_tiled(Moved(small_dataset.folder), encoder_file, tmp_path / "m", SETTINGS, tile_m=1000.0)
     assert [(tile.column, tile.row) for tile in made.tiles] == [(0, 0)]
-    assert describe(made).endswith(", 1 tiles of 1000 m")
+    assert describe(made).endswith(", tiles of 1000 m: 1")
 
 
 def test_progress_counts_the_scans_of_all_tiles(small_dataset, encoder_file, serial, tmp_path):
