@@ -26,6 +26,7 @@ from model_training.simulation.plan import SimulationPlan
 from model_training.simulation.simulate import simulate
 from model_training.stock import CALIBRATION
 from service.localization.localizer import Localizer
+from service.maps.map import Map
 from service.maps.reader import MapBundle
 from service.retrieval.encoder import Encoder
 
@@ -121,7 +122,7 @@ class Runs:
 
     def predictions(
         self,
-        bundle: MapBundle,
+        bundle: Map,
         dataset: Dataset,
         name: str,
         *,

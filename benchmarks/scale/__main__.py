@@ -19,13 +19,14 @@ from benchmarks.scale.search import SIZES, search_rows
 from benchmarks.scale.served import served_rows
 from benchmarks.scale.sources import RealDescriptors, real_descriptors, small_city
 from benchmarks.scale.store import store_rows
+from benchmarks.scale.town import town_rows
 from model_training.datasets.dataset import Dataset
 from model_training.stock import ENCODER
 from service.maps.index import vectors_of
 from service.retrieval.encoder import Encoder
 
 #: Parts of the report.
-PARTS = ("search", "served", "built", "store")
+PARTS = ("search", "served", "built", "store", "town")
 #: Code that determines the real descriptors.
 _DESCRIBING = (*SIMULATION, "service/imaging", "benchmarks/scale/sources.py", "model_training/mapping/places.py")
 
@@ -66,7 +67,7 @@ def main() -> None:
         choices=PARTS,
         default=list(PARTS),
         help="what to measure: search in drawn maps, requests with a prior on a tiled map (served), tiled builds that are killed, and both "
-        "engines (built), a map in object storage (store)",
+        "engines (built), a map in object storage (store), a town of 20 km, which takes an hour (town)",
     )
     parser.add_argument(
         "--stored",
@@ -94,6 +95,9 @@ def main() -> None:
     if "store" in arguments.only:
         path, dataset = arguments.stored or small_city(Runs(arguments.work, ENCODER))
         store_rows(report, path, Dataset(dataset), arguments.work)
+        report.write()
+    if "town" in arguments.only:
+        town_rows(report, Runs(arguments.work, ENCODER))
         report.write()
 
 

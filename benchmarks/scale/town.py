@@ -1,11 +1,37 @@
-"""The town: 20 km of streets in a square kilometre, built in tiles."""
+"""The town: 20 km of streets in a square kilometre, built in tiles, opened, and asked."""
+
+import multiprocessing
+import subprocess
+import sys
+import time
+from contextlib import suppress
+from multiprocessing.connection import Connection
+from pathlib import Path
+
+import numpy as np
 
 from benchmarks.plans import BOTH
+from benchmarks.report import ROOT, Report
+from benchmarks.runs import MAPPING, Runs, accepted_within, code_hash, pooled, share, within
+from model_training.datasets.dataset import Dataset
+from model_training.evaluation.measures import measure
 from model_training.simulation.plan import QueryPlan, SimulationPlan
 from model_training.training.recipe import EVALUATION_SEEDS
+from service.localization.localizer import Localizer
+from service.maps.content import NOT_SERVED
+from service.maps.manifest import Manifest, read_manifest
+from service.maps.tiles import TiledMap, open_map
+from service.retrieval.encoder import Encoder
+from service.runtime.engine import warm_up
 
 #: Extent of the town, m; queries with each depth camera; sequences of frames.
 TOWN_M, QUERIES, SEQUENCES, FRAMES = (1000.0, 1000.0), 500, 100, 5
+#: Edge of the tiles (m), limit of the open tiles under load (bytes), and queries of this load.
+TILE_M, OPEN_BYTES, LOAD = 500.0, 512 * 2**20, 150
+#: Time between two looks at the memory of a build, s.
+_LOOK_S = 1.0
+#: Bars of the accuracy: share within 1 m and recall at 1, by depth camera.
+_BARS = {"precise": (0.985, 0.985), "stereo": (0.965, 0.96)}
 
 
 def town_plan() -> SimulationPlan:
@@ -15,3 +41,132 @@ def town_plan() -> SimulationPlan:
         QueryPlan(name="sequence5", traversal=2, count=SEQUENCES, sequence=FRAMES, step_m=2.0, depths=("stereo",)),
     )
     return SimulationPlan(name="town", seed=EVALUATION_SEEDS[50], size_m=TOWN_M, queries=queries)
+
+
+def town_rows(report: Report, runs: Runs) -> None:
+    """Build the town if it is not kept, and add all its rows.
+
+    Args:
+        report: collects the rows. It is written after each step.
+        runs: simulates and answers, or reuses what is kept on disk.
+    """
+    dataset = runs.dataset(town_plan())
+    encoder = Encoder.open(runs.encoder).sha256[:12]
+    folder = runs.work / "maps" / f"town-tiled-{encoder}-{code_hash(*MAPPING)}"
+    if not folder.exists():
+        _build(report, dataset, folder)
+        report.write()
+    read = read_manifest(folder)
+    metres = read.counts.places * read.spacing_m
+    report.row(
+        "town.kb_per_metre",
+        _served_bytes(folder, read) / 1e3 / metres,
+        "kB/m",
+        bar=25,
+        better="lower",
+        why=f"{len(read.tiles)} tiles of {TILE_M:g} m, {metres / 1e3:.1f} km of streets",
+    )
+    _open_rows(report, folder, dataset)
+    report.write()
+    _accuracy_rows(report, runs, dataset, folder)
+
+
+def _build(report: Report, dataset: Dataset, out: Path) -> None:
+    """Build the map in another process, and watch time and memory of it and its children."""
+    out.parent.mkdir(parents=True, exist_ok=True)
+    command = [sys.executable, "-c", "from service.cli.start import main; main()", "build-map", str(dataset.folder)]
+    command += ["--out", str(out), "--name", "town", "--tile-m", f"{TILE_M:g}"]
+    began, peak = time.monotonic(), 0
+    process = subprocess.Popen(command, cwd=ROOT)
+    while process.poll() is None:
+        peak = max(peak, memory_of_tree(process.pid))
+        time.sleep(_LOOK_S)
+    if process.returncode:
+        raise RuntimeError(f"the build of the town ended with code {process.returncode}")
+    minutes = (time.monotonic() - began) / 60
+    report.row("town.build_minutes", minutes, "min", bar=12, better="lower", n=len(dataset.survey_poses()))
+    report.row("town.build_peak_gib", peak / 2**30, "GiB", bar=2, better="lower")
+
+
+def memory_of_tree(pid: int) -> int:
+    """Return the memory of a process and of all its descendants, bytes. Shared pages count once (PSS).
+
+    Args:
+        pid: number of the process.
+    """
+    total, waiting = 0, [pid]
+    while waiting:
+        number = waiting.pop()
+        with suppress(OSError):  # it has ended
+            fields = Path(f"/proc/{number}/smaps_rollup").read_text().split()
+            total += 1024 * int(fields[fields.index("Pss:") + 1])
+            for task in Path(f"/proc/{number}/task").iterdir():
+                waiting += [int(child) for child in (task / "children").read_text().split()]
+    return total
+
+
+def _served_bytes(folder: Path, read: Manifest) -> int:
+    """Return the size of the files that the service reads."""
+    tiles = [read_manifest(folder / tile.folder).files for tile in read.tiles]
+    return sum(entry.size for files in (read.files, *tiles) for name, entry in files.items() if name not in NOT_SERVED)
+
+
+def _open_rows(report: Report, folder: Path, dataset: Dataset) -> None:
+    """Add time to ready and memory under load, each in a process of its own."""
+    spawn = multiprocessing.get_context("spawn")
+    receiving, sending = spawn.Pipe(duplex=False)
+    process = spawn.Process(target=_ask, args=(folder, dataset.folder, sending))
+    process.start()
+    sending.close()
+    try:
+        ready_s, resident = receiving.recv()
+    except EOFError as error:
+        raise RuntimeError("the process that asks the town has ended; its error is above") from error
+    process.join()
+    report.row("town.ready_s", ready_s, "s", bar=2, better="lower", why="open the map, and answer one random query")
+    why = f"after {LOAD} queries without a prior, at most {OPEN_BYTES / 2**20:.0f} MiB of open tiles"
+    report.row("town.resident_mib", resident / 2**20, "MiB", bar=1000, better="lower", n=LOAD, why=why)
+
+
+def _ask(folder: Path, dataset: Path, sending: Connection) -> None:
+    began = time.monotonic()
+    opened = open_map(folder, open_bytes=OPEN_BYTES)
+    localizer = Localizer.open(opened)
+    warm_up(0.02, localizer)
+    ready_s = time.monotonic() - began
+    for number, frame in enumerate(Dataset(dataset).queries("drive1_precise")):
+        if number == LOAD:
+            break
+        localizer.localize(frame.query(opened.grid))
+    status = Path("/proc/self/status").read_text()
+    resident = 1024 * int(status.partition("VmRSS:")[2].split()[0])
+    sending.send((ready_s, resident))
+
+
+def _accuracy_rows(report: Report, runs: Runs, dataset: Dataset, folder: Path) -> None:
+    opened = TiledMap.open(folder)
+    classes = [] if opened.streets is None else [street.name for street in opened.streets.features]
+    for depth, (near, recall) in _BARS.items():
+        answers = runs.predictions(opened, dataset, f"drive1_{depth}")
+        figures, row = measure(answers, classes), f"town.{depth}"
+        share(report, f"{row}.within_1_m", figures, "within_1_m", near)
+        share(report, f"{row}.recall_at_1_5m", figures, "recall_at_1_5m", recall)
+        value, count, interval = pooled([figures], "recall_at_10_5m")
+        report.row(f"{row}.recall_at_10_5m", value, "share", n=count, ci95=interval)
+        report.share(f"{row}.forced_within_1_m", within(answers, 1.0))
+        wrong = answers.localized & ~accepted_within(answers, 1.0)
+        report.share(f"{row}.wrong_and_accepted", wrong, bar=0.002 if depth == "precise" else None, better="lower")
+        off = np.linalg.norm(answers.T_answer[:, :2, 3] - answers.T_true[:, :2, 3], axis=1)[answers.localized]
+        report.row(
+            f"{row}.mean_distance_error_m",
+            float(off.mean()) if len(off) else None,
+            "m",
+            bar=0.3 if depth == "precise" else None,
+            better="lower",
+            n=len(off),
+            why="answered queries",
+        )
+        report.write()
+    together = runs.predictions(opened, dataset, "sequence5_stereo", frames_each=FRAMES)
+    report.share("town.sequence5.stereo.within_1_m", accepted_within(together, 1.0), bar=0.995)
+    report.share("town.sequence5.stereo.forced_within_1_m", within(together, 1.0))

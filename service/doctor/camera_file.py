@@ -139,8 +139,9 @@ def check_distortion(camera: Camera) -> Finding:
         return Finding(
             "distortion",
             "ok",
-            "none given, so both images must be rectified",
-            "if straight walls look curved near the border of an image, send camera.distortion and camera.distortion_model",
+            "none given, so both images must be rectified; the command cannot tell",
+            "hold a ruler against a straight roof edge, kerb or door frame near the border of an image: if it looks curved, send "
+            "camera.distortion and camera.distortion_model",
         )
     try:
         rectification_of(lens)

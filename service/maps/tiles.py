@@ -93,19 +93,20 @@ class LocalTiles:
         """
 
 
-def open_map(path: Path, *, verify: bool = True, source: TileSource | None = None) -> Map:
+def open_map(path: Path, *, verify: bool = True, source: TileSource | None = None, open_bytes: int = OPEN_BYTES) -> Map:
     """Open a map of one bundle or a tiled map.
 
     Args:
         path: folder of the map.
         verify: compare the hash of every file with the manifest. Those of a tile are compared when it is first opened.
         source: where the tiles of a tiled map come from; None takes them from ``path``.
+        open_bytes: limit of the size of all open tiles of a tiled map, bytes.
 
     Raises:
         BundleError: the map is missing, damaged, of another format, or inconsistent.
     """
     if read_manifest(path).tiles:
-        return TiledMap.open(path, verify=verify, source=source)
+        return TiledMap.open(path, verify=verify, source=source, open_bytes=open_bytes)
     return MapBundle.open(path, verify=verify)
 
 

@@ -331,7 +331,13 @@ def watcher_of(registry: MapRegistry, settings: Settings) -> MapWatcher:
         cache.clean()
         stored = [StoredMap(each, cache) for each in urls]
     paths = [each for each in settings.maps if isinstance(each, Path)]
-    return MapWatcher(registry, paths, warm=partial(warm_up, settings.false_accept_rate), stored=stored)
+    return MapWatcher(
+        registry,
+        paths,
+        warm=partial(warm_up, settings.false_accept_rate),
+        stored=stored,
+        open_tile_bytes=settings.open_tile_bytes,
+    )
 
 
 def warm_up(false_accept_rate: float, localizer: Localizer) -> None:

@@ -13,7 +13,7 @@ from service.errors import BundleError, StreetfixError
 from service.localization.localizer import Localizer
 from service.maps.manifest import TILES_FOLDER, Manifest, Tile, read_manifest
 from service.maps.store.stored_map import StoredMap
-from service.maps.tiles import TileSource, open_map
+from service.maps.tiles import OPEN_BYTES, TileSource, open_map
 from service.runtime.map_registry import MapRegistry, Refused, bundle_paths, twin_error, version_of
 from service.runtime.serving_table import Key, MapVersion
 from service.runtime.wakeup import Wakeup
@@ -75,6 +75,7 @@ class MapWatcher:
         warm: called with every new map before it serves, so that its first request is as fast as the next. If it raises, the map is
             refused for this reason.
         stored: maps in object storage, with which the service was started. Their folders in the cache are folders of bundles.
+        open_tile_bytes: limit of the size of all open tiles of a tiled map, bytes.
     """
 
     def __init__(
@@ -84,11 +85,12 @@ class MapWatcher:
         *,
         warm: Callable[[Localizer], None],
         stored: Sequence[StoredMap] = (),
+        open_tile_bytes: int = OPEN_BYTES,
     ) -> None:
         self._registry = registry
         self._stored = {each.folder: each for each in stored}
         self._paths = (*paths, *self._stored)
-        self._warm = warm
+        self._warm, self._open_tile_bytes = warm, open_tile_bytes
         self._stop, self._wakeup = threading.Event(), Wakeup()
         self._thread: threading.Thread | None = None
         self._manifests: dict[Path, tuple[Stamp, Manifest]] = {}
@@ -227,7 +229,8 @@ class MapWatcher:
         try:
             if (stored := self._stored.get(bundle.path.parent)) is not None:
                 source = _LoggedTiles(stored.tiles(bundle.path))
-            localizer = Localizer.open(open_map(bundle.path, source=source), provider=self._registry.provider)
+            opened = open_map(bundle.path, source=source, open_bytes=self._open_tile_bytes)
+            localizer = Localizer.open(opened, provider=self._registry.provider)
             self._warm(localizer)
             self._registry.mount(localizer)
         except StreetfixError as error:

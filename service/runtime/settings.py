@@ -24,6 +24,7 @@ from pydantic_settings import (
 from service.errors import BundleError, RequestError
 from service.imaging.picture_headers import DEFAULT_LIMITS
 from service.maps.store.remote import checked_url, is_url
+from service.maps.tiles import OPEN_BYTES
 from service.option_limits import FALSE_ACCEPT_RATE, LEAST_FALSE_ACCEPT_RATE
 from service.retrieval.encoder import Provider
 from service.runtime.environment import CLIENT_KEY, CONFIG, did_you_mean, require_known, setting_names
@@ -99,6 +100,12 @@ class Settings(BaseSettings):
         ge=1_000_000,
         le=2**60,
         description="bound of the tiles in tile_cache; the least recently used ones are deleted",
+    )
+    open_tile_bytes: int = Field(
+        OPEN_BYTES,
+        ge=1_000_000,
+        le=2**60,
+        description="bound of the tiles of a tiled map that a worker has open; the least recently used ones are closed",
     )
     strict: bool = Field(
         False,

@@ -1,6 +1,6 @@
 """A folder of tiles that several processes share. It is bounded: the least recently used tiles make room for new ones.
 
-``CACHE/KEY/tiles/VERSION-HASH`` is the folder of a tile, and ``CACHE/KEY/VERSION`` the folder of a version of a map. Such a folder is
+``CACHE/KEY/tiles/VERSION`` is the folder of a tile, and ``CACHE/KEY/VERSION`` the folder of a version of a map. Such a folder is
 whole or missing. A process fills ``.NAME.partial`` beside it, whose lock it holds, and renames it. Whoever wants the same folder waits
 for the lock. The system releases the lock of a killed process, so the next process takes over.
 
