@@ -1,7 +1,7 @@
 """``streetfix calibrate``."""
 
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated
 
@@ -143,7 +143,7 @@ def _calibrate_rig(
 ) -> None:
     began = time.monotonic()
     console = Console(highlight=False, soft_wrap=True)
-    bundle = part_for(open_map(folder), source)
+    bundle = part_for(open_map(folder), source, queries)
     calibration = bundle.calibration
     if calibration is None:
         raise BundleError(
@@ -183,21 +183,23 @@ def _calibrate_rig(
         console.print(f"written: {out}")
 
 
-def part_for(opened: Map, source: Dataset | RigFile) -> Map:
+def part_for(opened: Map, source: Dataset | RigFile, queries: Sequence[str] = ()) -> Map:
     """Return the part of a map that calibrates a rig: all of it, or of a tiled map the tiles of the recording.
 
     Args:
         opened: the map.
         source: the recording, or the rig whose images are rendered from the first tile.
+        queries: names of the query sets of the recording; empty for all.
 
     Raises:
-        BundleError: the map has too many tiles to localize a recording without ground truth in all of them.
+        BundleError: the recording lies in too many tiles, or the map has too many to localize one without ground truth in all of them.
     """
     if not isinstance(opened, TiledMap):
         return opened
     if isinstance(source, RigFile):
-        return opened.around(np.array(opened.T_map_place[:1, :3, 3]))
-    frames = [frame for name in source.query_sets(with_truth=True) for frame in source.queries(name)]
+        return opened.around(lambda: np.array(opened.T_map_place[:1, :3, 3]))
+    names = [name for name in source.query_sets(with_truth=True) if not queries or name in queries]
+    frames = [frame for name in names for frame in source.queries(name)]
     positions = [frame.T_map_camera[:3, 3] for frame in frames if frame.T_map_camera is not None]
     if not positions and len(opened.tiles) > MOST_AROUND:
         raise BundleError(
@@ -205,7 +207,14 @@ def part_for(opened: Map, source: Dataset | RigFile) -> Map:
             "with queries/NAME/poses.txt, or calibrate on one of the tiles with --out",
             field="tiles",
         )
-    return opened.around(np.array(positions) if positions else opened.T_map_place[:, :3, 3])
+    xyz = np.array(positions) if positions else opened.T_map_place[:, :3, 3]
+    if (count := len(opened.tiles.at(xyz[:, :2]))) > MOST_AROUND:
+        raise BundleError(
+            f"{opened.path}: the recording lies in {count} tiles, and a correction is learned in at most {MOST_AROUND}; give a part of it "
+            "with --queries",
+            field="tiles",
+        )
+    return opened.around(lambda: xyz)
 
 
 def _write(out: Path, calibration: Calibration) -> None:

@@ -8,6 +8,9 @@ from typing import Any
 from model_training.mapping.diff import diff_of
 from model_training.mapping.merge import merge_maps
 from service.errors import BundleError
+from service.maps.calibration import Calibration, read_calibration
+from service.maps.content import CALIBRATION_FILE
+from service.maps.files import read_file
 from service.maps.manifest import Manifest, Tile, read_manifest
 from service.maps.reader import MapBundle
 from service.maps.tiled_writer import write_tiled
@@ -70,7 +73,8 @@ def merge_tiled(
 ) -> Manifest:
     """Merge two tiled maps into a new one; return its manifest.
 
-    A square that only one map has keeps its tile. Where both have a tile, ``merge_maps`` merges the two, unless they are the same.
+    A square that only one map has keeps its tile. Where both have a tile, ``merge_maps`` merges the two, unless they are the same. A
+    correction for a rig stays if both maps have it.
 
     Args:
         first: folder of a tiled map.
@@ -101,7 +105,14 @@ def merge_tiled(
             else:
                 folders[square] = first / one[square].folder if square in one else second / two[square].folder
             report("merge", number, len(squares))
-        return write_tiled(out, folders, read.tile_m or 0.0, name=name or read.name, overwrite=overwrite)
+        rigs = [None if each is None else each.rig for each in (_calibration_of(first), _calibration_of(second))]
+        rig = rigs[0] if rigs[0] == rigs[1] else None
+        return write_tiled(out, folders, read.tile_m or 0.0, name=name or read.name, overwrite=overwrite, rig=rig)
+
+
+def _calibration_of(path: Path) -> Calibration | None:
+    file = path / CALIBRATION_FILE
+    return read_calibration(read_file(file), path=str(file))
 
 
 def _same_squares(first: Path, second: Path) -> tuple[Manifest, Manifest]:

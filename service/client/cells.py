@@ -2,6 +2,7 @@
 
 import math
 import uuid
+from urllib.parse import quote
 
 from service.contract import schema
 
@@ -27,4 +28,4 @@ def cell_of(prior: schema.Prior | None, map_name: str | None) -> str:
         )
     elif prior is not None and prior.position is not None:
         place = "map-" + "-".join(str(math.floor(each / CELL_M)) for each in (prior.position.x, prior.position.y))
-    return place if map_name is None else f"{map_name.partition('@')[0]}-{place}"
+    return place if map_name is None else f"{quote(map_name.partition('@')[0], safe='')[:64]}-{place}"

@@ -98,7 +98,13 @@ def localize_sequence(prepared: PreparedRequest[schema.SequenceRequest]) -> Call
     Args:
         prepared: the request and its encoded images.
     """
-    return Call("POST", "/v1/localize/sequence", schema.LocalizeAnswer.model_validate_json, _numbered(prepared))
+    return Call(
+        "POST",
+        "/v1/localize/sequence",
+        schema.LocalizeAnswer.model_validate_json,
+        _numbered(prepared),
+        {HEADER: cell_of(prepared.document.prior, prepared.document.map)},
+    )
 
 
 def localize_batch(prepared: PreparedRequest[schema.BatchRequest]) -> Call[list[schema.LocalizeAnswer | RefusedError]]:
@@ -111,7 +117,9 @@ def localize_batch(prepared: PreparedRequest[schema.BatchRequest]) -> Call[list[
     def read(body: bytes) -> list[schema.LocalizeAnswer | RefusedError]:
         return [_outcome(each) for each in _Outcomes.model_validate_json(body).outcomes]
 
-    return Call("POST", "/v1/localize/batch", read, _numbered(prepared))
+    first = prepared.document.requests[0]
+    cell = cell_of(first.prior, first.map)
+    return Call("POST", "/v1/localize/batch", read, _numbered(prepared), {HEADER: cell})
 
 
 def maps() -> Call[list[schema.MapEntry]]:

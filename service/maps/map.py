@@ -1,5 +1,6 @@
 """An open map: its places, views, descriptors, streets, calibration and cloud, however its files are organised."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -68,11 +69,11 @@ class Map:
         """
         return self
 
-    def around(self, positions_m: Float64[NDArray[np.float64], "n 3"]) -> "Map":  # noqa: ARG002 - as of TiledMap
+    def around(self, positions_of: Callable[[], Float64[NDArray[np.float64], "n 3"]]) -> "Map":  # noqa: ARG002 - as of TiledMap
         """Return the part of the map around some positions: all of it. A tiled map has parts (``TiledMap.around``).
 
         Args:
-            positions_m: positions, map frame, m, the most important first.
+            positions_of: returns the positions, map frame, m, the most important first. Only a tiled map needs them.
         """
         return self
 

@@ -28,7 +28,7 @@ from service.maps.map import Map
 from service.maps.reader import MapBundle
 from service.maps.streets import Streets
 from service.registration.surfel_map import SurfelMap
-from service.registration.surfel_tiles import SurfelTiles, nearest_square
+from service.registration.surfel_tiles import SurfelTiles
 
 #: Largest number of tiles that are searched for one query. A map of more tiles needs a search index, which chooses them.
 MOST_SEARCHED = 6
@@ -66,6 +66,13 @@ class TileSource(Protocol):
             tiles: the most probable first. They replace those of the call before.
         """
 
+    def used(self, tile: Tile) -> None:
+        """Take note that an open tile is in use. It is called for every query.
+
+        Args:
+            tile: as the manifest of the map lists it.
+        """
+
 
 @dataclass(frozen=True, slots=True)
 class LocalTiles:
@@ -90,6 +97,13 @@ class LocalTiles:
 
         Args:
             tiles: tiles of the map.
+        """
+
+    def used(self, tile: Tile) -> None:
+        """Do nothing, because no tile is deleted.
+
+        Args:
+            tile: a tile of the map.
         """
 
 
@@ -150,7 +164,9 @@ class OpenTiles:
         corners = np.array(
             [[tile.column, tile.row, tile.column + 1, tile.row + 1] for tile in of_map.tiles], np.float64
         )
-        self.squares_m = corners * (of_map.tile_m or 0.0)
+        self._tile_m = of_map.tile_m or 1.0
+        self._number = {(tile.column, tile.row): number for number, tile in enumerate(of_map.tiles)}
+        self.squares_m = corners * self._tile_m
         self.first_place = np.cumsum([0, *(tile.counts.places for tile in of_map.tiles)])
 
     def __len__(self) -> int:
@@ -186,6 +202,21 @@ class OpenTiles:
                 self._close_some()
             return made
 
+    def at(self, xy_m: Float64[NDArray[np.float64], "n 2"]) -> Int64[NDArray[np.int64], " m"]:
+        """Return the numbers of the tiles at some positions, each once, in the order of the positions.
+
+        A position outside of all squares counts as one in the nearest square.
+
+        Args:
+            xy_m: x and y, map frame, m.
+        """
+        cells, first = np.unique(np.floor(xy_m / self._tile_m).astype(np.int64), axis=0, return_index=True)
+        found = []
+        for row in np.argsort(first):
+            number = self._number.get((int(cells[row, 0]), int(cells[row, 1])))
+            found.append(int(_away_m(self.squares_m, xy_m[first[row]]).argmin()) if number is None else number)
+        return in_order(np.array(found, np.int64))
+
     def expect_around(self, xy_m: Float64[NDArray[np.float64], "2"]) -> None:
         """Tell the source which closed tiles a moving camera may reach soon.
 
@@ -213,6 +244,7 @@ class OpenTiles:
             if known is not None:
                 for number in numbers:
                     self._opened.move_to_end(number)
+                    self._source.used(self._manifest.tiles[number])
                 return known
         made = make(numbers)
         with self._changing:
@@ -243,12 +275,16 @@ class OpenTiles:
         has_brightness = opened is not None and all(
             each.cloud is not None and each.cloud.has_brightness for each in opened
         )
-        return SurfelTiles(squares_m, cloud_of, middle_m, has_brightness)
+        drawn = range(len(numbers)) if opened is not None or isinstance(self._source, LocalTiles) else None
+        return SurfelTiles(
+            squares_m, cloud_of, middle_m, has_brightness, lambda: self.opened if drawn is None else drawn
+        )
 
     def _known(self, number: int) -> MapBundle | None:
         with self._changing:
             if number in self._opened:
                 self._opened.move_to_end(number)
+                self._source.used(self._manifest.tiles[number])
             return self._opened.get(number)
 
     def _close_some(self) -> None:
@@ -437,25 +473,28 @@ class TiledMap(Map):
         chosen = np.arange(len(self.tiles))
         if near is not None:
             self.tiles.expect_around(near[0])
-        if near is not None and (inside := _away_m(self.tiles.squares_m, near[0]) <= near[1]).any():
-            chosen = np.flatnonzero(inside)
+        if near is not None and ((away_m := _away_m(self.tiles.squares_m, near[0])) <= near[1]).any():
+            chosen = np.argsort(away_m, kind="stable")
+            chosen = chosen[away_m[chosen] <= near[1]]  # the nearest first
         if len(chosen) > MOST_SEARCHED and self.inverted is not None:
             views = self.inverted.most_similar(descriptor, min(LISTED, self.manifest.counts.views))
             similar = in_order(
                 np.searchsorted(self.tiles.first_place, views // self.manifest.headings, side="right") - 1
             )
-            chosen = in_order(np.concatenate([similar[np.isin(similar, chosen)], chosen]))[:MOST_SEARCHED]
+            nearest = chosen[:1] if near is not None else chosen[:0]  # the tile at the prior is always searched
+            chosen = in_order(np.concatenate([nearest, similar[np.isin(similar, chosen)], chosen]))[:MOST_SEARCHED]
         return self._region(chosen)
 
-    def around(self, positions_m: Float64[NDArray[np.float64], "n 3"]) -> Map:
+    def around(self, positions_of: Callable[[], Float64[NDArray[np.float64], "n 3"]]) -> Map:
         """Return the tiles around some positions, as a map.
 
         Args:
-            positions_m: positions, map frame, m, the most important first. They lie in few tiles. A position in a tile beyond
+            positions_of: returns the positions, map frame, m, the most important first. They lie in few tiles. A position in a tile beyond
                 ``MOST_AROUND`` counts as one at the edge of the nearest of the others.
         """
+        positions_m = positions_of()
         self.tiles.expect_around(positions_m[0, :2])
-        return self._region(in_order(nearest_square(self.tiles.squares_m, positions_m[:, :2]))[:MOST_AROUND])
+        return self._region(self.tiles.at(positions_m[:, :2])[:MOST_AROUND])
 
     def _region(self, numbers: Int64[NDArray[np.int64], " n"]) -> Map:
         return self.tiles.region(tuple(sorted(numbers.tolist())), self._made)

@@ -1,6 +1,6 @@
 """The cloud of a tiled map: one surfel map for each tile. A pose is registered and rendered on the cloud of its own tile."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -21,12 +21,14 @@ class SurfelTiles:
         cloud_of: returns the surfel map of a tile by its row in ``squares_m``.
         origin_m: origin of the frame of the states that ``align`` registers, map frame, m.
         has_brightness: whether all tiles have intensities.
+        drawn: returns the rows of the tiles that may be drawn. A tile that is still in its store would have to be fetched first.
     """
 
     squares_m: Float64[NDArray[np.float64], "T 4"]
     cloud_of: Callable[[int], SurfelMap]
     origin_m: Float64[NDArray[np.float64], "3"]
     has_brightness: bool
+    drawn: Callable[[], Sequence[int]]
 
     def at(self, position_m: Float64[NDArray[np.float64], "3"]) -> SurfelMap:
         """Return the surfel map of the tile at a position, or of the nearest tile.
@@ -37,13 +39,13 @@ class SurfelTiles:
         return self.cloud_of(int(nearest_square(self.squares_m, position_m[None, :2])[0]))
 
     def parts(self, most: int) -> tuple[SurfelMap, ...]:
-        """Return the surfel maps of some tiles, evenly chosen among all. They overlap at the edges of their squares.
+        """Return the surfel maps of some tiles to draw, evenly chosen. They overlap at the edges of their squares.
 
         Args:
             most: largest number of them.
         """
-        count = len(self.squares_m)
-        return tuple(self.cloud_of(number) for number in range(0, count, -(-count // most)))
+        rows = self.drawn()
+        return tuple(self.cloud_of(row) for row in rows[:: max(1, -(-len(rows) // most))])
 
     def align(
         self,

@@ -56,7 +56,7 @@ def starts_from(
         likeness: ranks the starts of several frames by their mean similarity; None for one frame. Without it, perceptual aliases of
             single frames could crowd out the right place (decision 0071).
     """
-    poses = np.concatenate([_poses(frame, frames[0], lidar_height_m) for frame in frames])
+    poses = poses_of_matches(frames, lidar_height_m)
     similarity = np.concatenate([frame.matches.similarity for frame in frames])
     kept = _chosen(poses, similarity, prior, settings, settings.most if likeness is None else settings.pooled)
     if likeness is not None:
@@ -83,6 +83,16 @@ def _chosen(
         order = np.argsort(-similarity, kind="stable")
         kept = _distinct(order[allowed[order]], poses[:, :2, 3], heading, kept, most, settings)
     return kept
+
+
+def poses_of_matches(frames: tuple[Frame, ...], lidar_height_m: float) -> Float64[NDArray[np.float64], "n 4 4"]:
+    """Return T_map_level of the reference for every match of every frame.
+
+    Args:
+        frames: image pairs, the reference first. A match of another frame gives the pose of the reference at that time.
+        lidar_height_m: height of the places' LiDAR above the ground, m.
+    """
+    return np.concatenate([_poses(frame, frames[0], lidar_height_m) for frame in frames])
 
 
 def _poses(frame: Frame, reference: Frame, lidar_height_m: float) -> Float64[NDArray[np.float64], "n 4 4"]:

@@ -2,7 +2,6 @@
 
 import logging
 import os
-import re
 import threading
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -26,8 +25,6 @@ _POLL_S = 0.25
 #: For a worker that cannot open a version that serves in the others: seconds between two attempts, and the number of attempts after
 #: which it also tries unchanged files again.
 _RETRY_S, _ROUNDS_UNTIL_ANEW = 1.0, 30
-#: Address of a store in a message.
-_ADDRESS = re.compile(r"\b\w+://\S*")
 
 
 #: Stamp that no folder has.
@@ -43,6 +40,9 @@ class _LoggedTiles:
 
     def expect(self, tiles: Sequence[Tile]) -> None:
         self._tiles.expect(tiles)
+
+    def used(self, tile: Tile) -> None:
+        self._tiles.used(tile)
 
     def folder(self, tile: Tile) -> Path:
         try:
@@ -96,6 +96,7 @@ class MapWatcher:
         self._manifests: dict[Path, tuple[Stamp, Manifest]] = {}
         self._failed: dict[Path, tuple[Stamp, StreetfixError]] = {}
         self._due: set[Key] = set()  # versions to unmount
+        self._only_current = False  # whether a scan drops all versions of stored maps but the current ones
 
     def open_first(self, *, strict: bool = False, wait: Callable[[float], object] = time.sleep) -> None:
         """Mount the bundles of the folders when the service starts. ``MapRegistry.refused`` lists those that cannot be opened.
@@ -112,7 +113,10 @@ class MapWatcher:
         """
         table = self._registry.table
         if not (table.is_shared and table.read().started):
+            # A cache may still have later versions of a map that was rolled back in its store.
+            self._only_current = True
             self.scan()
+            self._only_current = False
             self._require(strict=strict)
         rounds = 0
         while lacking := self._registry.join():
@@ -297,6 +301,8 @@ class MapWatcher:
         for folder, stored in self._stored.items():
             try:
                 stored.refresh()
+                if self._only_current:
+                    stored.forget(())
             except StreetfixError as error:
                 if not self._is_refused(folder, ()):
                     self._refuse(folder, (), error)
@@ -384,12 +390,17 @@ class MapWatcher:
     def _tell_refused(self) -> None:
         """Publish the refused bundles to the request handlers.
 
-        Only the name of the folder is shown, and no address of a store, because a health probe needs no key.
+        Only the name of the folder is shown, and nothing of a store, because a health probe needs no key.
         """
         self._registry.refused = tuple(
-            Refused(path.name or str(path), _ADDRESS.sub("...", error.message.replace(f"{path.parent}{os.sep}", "")))
+            Refused(path.name or str(path), self._shown(path, error))
             for path, (_, error) in sorted(self._failed.items())
         )
+
+    def _shown(self, path: Path, error: StreetfixError) -> str:
+        if path in self._stored or path.parent in self._stored:
+            return "it cannot be served from its store; the log of the service says why"
+        return error.message.replace(f"{path.parent}{os.sep}", "")
 
 
 def manifest_key(manifest: Manifest) -> Key:

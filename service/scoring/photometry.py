@@ -197,15 +197,14 @@ class BrightnessScorer:
         greys: list[Float32[NDArray[np.float32], "H W"]],
         pose: Registered,
     ) -> float:
-        raycaster = self._raycasters.at(pose.camera_m)
-        brightness = raycaster.cloud.brightness
-        if brightness is None:
-            return 0.0
-        surfel_of = [
-            own if seen is None else np.where(seen, own, np.int32(-1))
-            for own, seen in zip(
-                cast_rays(raycaster, [each.picture for each in self._measured], pose), self._seen, strict=True
-            )
-        ]
-        pairs = zip(surfel_of, greys, strict=True)
-        return float(np.mean([agreement_of_brightness(brightness, own, grey, self._settings) for own, grey in pairs]))
+        found = []
+        for each, seen, grey in zip(self._measured, self._seen, greys, strict=True):
+            raycaster = self._raycasters.at(each.pose(pose).camera_m)
+            brightness = raycaster.cloud.brightness
+            if brightness is None:
+                return 0.0
+            (surfel_of,) = cast_rays(raycaster, [each.picture], pose)
+            if seen is not None:
+                surfel_of = np.where(seen, surfel_of, np.int32(-1))
+            found.append(agreement_of_brightness(brightness, surfel_of, grey, self._settings))
+        return float(np.mean(found))

@@ -166,5 +166,8 @@ class RenderedDepthScorer:
 
     def _agreement(self, pose: Registered) -> Agreement:
         """Mean over all frames that have points."""
-        pairs, cloud = zip(self._measured, self._projected, strict=True), self._cloud.at(pose.camera_m)
-        return Agreement.mean([agreement(cloud, projected, each.pose(pose)) for each, projected in pairs])
+        found = []
+        for each, projected in zip(self._measured, self._projected, strict=True):
+            own = each.pose(pose)
+            found.append(agreement(self._cloud.at(own.camera_m), projected, own))
+        return Agreement.mean(found)

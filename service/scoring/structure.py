@@ -259,9 +259,10 @@ class StructureScorer:
         return Scores(found @ np.array(astuple(self._weights)), dict(zip(Structure.__slots__, found.T, strict=True)))
 
     def _structure(self, pose: Registered) -> NDArray[np.float64]:
-        found, cloud = [], self._cloud.at(pose.camera_m)
+        found = []
         for image, each in zip(self._images, self._measured, strict=True):
             own = each.pose(pose)
+            cloud = self._cloud.at(own.camera_m)
             T = transform_from(own.R_map_level @ each.frame.R_level_camera, own.camera_m - cloud.origin_m)
             rendered_m = render(
                 cloud.surfels,

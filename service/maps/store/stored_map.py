@@ -4,6 +4,7 @@ import hashlib
 import os
 import re
 import threading
+import time
 from collections import deque
 from collections.abc import Collection, Mapping, Sequence
 from contextlib import suppress
@@ -17,6 +18,8 @@ from service.maps.store.cache import TileCache, is_used_now
 from service.maps.store.fetch import fetch_files, shared_files, shared_prefix, tile_manifest
 from service.maps.store.remote import Remote, checked_url
 
+#: Time between two marks of an open tile as used, s.
+USED_EVERY_S = 60.0
 _UNUSUAL = re.compile(r"[^A-Za-z0-9._-]+")
 
 
@@ -122,6 +125,7 @@ class StoreTiles:
         self._expected = deque[Tile]()
         self._expecting = threading.Lock()
         self._fetches_ahead = False
+        self._used_s: dict[str, float] = {}
         self._shared: Mapping[str, Path] | None = None
 
     def folder(self, tile: Tile) -> Path:
@@ -137,7 +141,9 @@ class StoreTiles:
             BundleError: the store cannot be read, a file is damaged, or the cache cannot be used.
         """
         folder = self._version.parent / tile.folder
-        if not is_used_now(folder):
+        with self._cache.telling():
+            is_there = is_used_now(folder)
+        if not is_there:
             self._cache.once(folder, partial(self._fetch, tile))
         return folder
 
@@ -161,8 +167,22 @@ class StoreTiles:
                     self._fetches_ahead = False
                     return
                 tile = self._expected.popleft()
-            with suppress(BundleError):  # the request that needs the tile fetches it again, and says what is wrong
+            with suppress(
+                BundleError, OSError
+            ):  # the request that needs the tile fetches it again, and says what is wrong
                 self.folder(tile)
+
+    def used(self, tile: Tile) -> None:
+        """Mark a tile as used, so that the bound of the cache deletes others first. It costs nothing more than once a minute.
+
+        Args:
+            tile: an open tile.
+        """
+        now_s = time.monotonic()
+        if now_s - self._used_s.get(tile.version, -USED_EVERY_S) >= USED_EVERY_S:
+            self._used_s[tile.version] = now_s
+            with suppress(OSError):  # the cache may delete the tile sooner, and it stays open
+                is_used_now(self._version.parent / tile.folder)
 
     def _fetch(self, tile: Tile, into: Path) -> None:
         manifest, data = tile_manifest(self._remote, tile)

@@ -18,6 +18,7 @@ def at(x: float, y: float) -> schema.Prior:
         (at(10.0, 999.0), None, "map-0-0"),
         (at(-1.0, 1000.0), "town", "town-map--1-1"),
         (at(0.0, 0.0), "town@3f9c2a7be01d4586", "town-map-0-0"),
+        (at(5.0, 5.0), "Zürich", "Z%C3%BCrich-map-0-0"),
         (schema.Prior(wgs84=schema.PriorWgs84(latitude_deg=49.016, longitude_deg=-8.421)), None, "earth-4901--843"),
     ],
 )

@@ -254,6 +254,7 @@ def test_a_sequence_says_where_each_camera_stood(ask: Asking, answer_json: Json)
         frames = json.loads(parts["request"])["frames"]
         assert request.url.path == "/v1/localize/sequence"
         assert sorted(parts) == ["depth0", "depth1", "request", "rgb0", "rgb1"]
+        assert len(request.headers["x-streetfix-cell"]) >= 8
         assert frames[0]["T_reference_camera"] is None
         assert frames[1]["T_reference_camera"]["position"]["z"] == 1.0
         return httpx.Response(200, json=answer_json())
@@ -275,7 +276,12 @@ def test_a_batch_has_answers_and_refusals_in_their_places(ask: Asking, answer_js
     }
     outcomes = [{"answer": answer_json(), "problem": None}, {"answer": None, "problem": refusal}]
     frames = [Frame(rgb=RGB, depth=DEPTH, camera=CAMERA)] * 2
-    first, second = ask(lambda _: httpx.Response(200, json={"outcomes": outcomes}), "localize_batch", frames, map="m")
+
+    def handler(request: httpx.Request) -> httpx.Response:
+        assert request.headers["x-streetfix-cell"].startswith("m-")
+        return httpx.Response(200, json={"outcomes": outcomes})
+
+    first, second = ask(handler, "localize_batch", frames, map="m")
     assert first.status == "LOCALIZED"
     assert isinstance(second, RefusedError)
     assert (second.problem, second.field) == ("no-depth", "requests.1.depth")

@@ -18,11 +18,12 @@ from model_training.mapping.tiled_care import diff_of_tiles, merge_tiled, tiles_
 from model_training.mapping.verify import damage_of
 from service.errors import BundleError
 from service.localization.localizer import Localizer
+from service.maps.calibration import RigCorrection
 from service.maps.manifest import read_manifest
 from service.maps.reader import MapBundle
 from service.maps.tiled_writer import write_tiled
 from service.maps.tiles import TiledMap
-from service.maps.writer import write_bundle
+from service.maps.writer import replace_calibration, write_bundle
 
 TILE_M = 50.0
 
@@ -62,6 +63,33 @@ def test_merged_halves_are_the_whole_map(
     merged = merge_tiled(*halves, tmp_path / "merged")
     assert merged.version == whole.version
     assert sorted(each.name for each in tmp_path.iterdir()) == ["merged", "whole"]
+
+
+def test_a_correction_for_a_rig_stays_if_both_maps_have_it(
+    calibration_json: Any, small_map: Path, squares: dict[tuple[int, int], Path], tmp_path: Path
+) -> None:
+    rig = {
+        "scale": 0.5,
+        "offset": -1.0,
+        "lower_only": False,
+        "source": "drive",
+        "measured_on": "a drive",
+        **dict.fromkeys(("frames", "right", "outside", "accepted", "accepted_wrong", "outside_accepted"), 9),
+        **dict.fromkeys(("error_before", "error_after", "wrong_share_upper", "outside_share_upper"), 0.1),
+    }
+    numbers, bundle = sorted(squares), MapBundle.open(squares[sorted(squares)[0]])
+    for k, name in enumerate(("one", "other", "none")):
+        bundle = MapBundle.open(squares[numbers[min(k, 1)]])
+        content = replace(content_of(bundle), cloud=bundle.cloud, calibration=calibration_json())
+        write_bundle(tmp_path / f"tile-{name}", content)
+        write_tiled(tmp_path / name, {numbers[k]: tmp_path / f"tile-{name}"}, TILE_M, name=name)
+        if name != "none":
+            replace_calibration(tmp_path / name, calibration_json(rig=rig))
+    for second, expected in (("other", RigCorrection.model_validate(rig)), ("none", None)):
+        merge_tiled(tmp_path / "one", tmp_path / second, tmp_path / f"with-{second}")
+        calibration = TiledMap.open(tmp_path / f"with-{second}").calibration
+        assert calibration is not None
+        assert calibration.rig == expected
 
 
 def test_a_square_of_both_maps_is_merged(

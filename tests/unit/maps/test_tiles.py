@@ -154,8 +154,8 @@ def test_tiles_are_closed_beyond_the_limit(tiled_path: Path, small_dataset: Any)
 def test_regions_are_kept_while_their_tiles_are_open(tiled: TiledMap) -> None:
     positions = tiled.tiles.squares_m[:2].reshape(2, 2, 2).mean(axis=1)
     both = np.column_stack([positions, np.zeros(2)])
-    region = tiled.around(both)
-    assert tiled.around(both[::-1]) is region
+    region = tiled.around(lambda: both)
+    assert tiled.around(lambda: both[::-1]) is region
     assert len(region.places) == sum(tile.counts.places for tile in tiled.manifest.tiles[:2])
     assert region.views["place"].tolist() == sorted(region.views["place"].tolist())
 
@@ -195,6 +195,10 @@ def test_the_search_index_chooses_the_tiles_of_a_large_map(
         part = opened.searched(vectors[column])
         assert set(part.numbers_of(np.arange(len(part.places), dtype=np.int32)) // 12) >= {column}
         assert len(part.places) == 12 * tiles_module.MOST_SEARCHED
+    wide = opened.searched(vectors[8], (np.array([210.0, 10.0]), 1000.0))
+    assert {12 * 4, 12 * 8} <= set(
+        wide.numbers_of(np.arange(len(wide.places), dtype=np.int32)).tolist()
+    )  # at the prior; most similar
     beside = opened.searched(vectors[8], (np.array([60.0, 10.0]), 20.0))
     assert beside.T_map_place[:, 0, 3].tolist() == [10.0] * 12 + [60.0] * 12
 
@@ -318,6 +322,15 @@ def test_the_nearest_square_of_a_position() -> None:
     xy = np.array([[10.0, 10.0], [60.0, 49.0], [-5.0, 200.0], [120.0, -7.0]])
     assert nearest_square(squares_m, xy).tolist() == [0, 1, 0, 1]
     assert in_order(np.array([3, 1, 3, 0, 1])).tolist() == [3, 1, 0]
+
+
+def test_tiles_at_positions(tiled: TiledMap) -> None:
+    squares_m = tiled.tiles.squares_m
+    middles = squares_m.reshape(-1, 2, 2).mean(axis=1)
+    assert tiled.tiles.at(middles[::-1]).tolist() == list(range(len(squares_m)))[::-1]
+    assert tiled.tiles.at(np.concatenate([middles[1:2], middles[:1], middles[1:2]])).tolist() == [1, 0]
+    low = squares_m[0, :2] - 1e4
+    assert tiled.tiles.at(low[None]).tolist() == nearest_square(squares_m, low[None]).tolist()
 
 
 def test_local_tiles_lie_in_the_folder_of_the_map(tiled: TiledMap) -> None:

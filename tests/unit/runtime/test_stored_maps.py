@@ -75,6 +75,21 @@ def test_a_stored_map_serves_and_a_new_version_replaces_it(town: Town) -> None:
     assert town.cached == {first, second}
 
 
+def test_a_restart_serves_the_version_that_the_store_was_rolled_back_to(town: Town) -> None:
+    first = town.push()
+    registry, watcher = town.service()
+    watcher.open_first()
+    second = town.push()
+    watcher.scan()
+    assert version_of(registry) == second
+    push(town.folder / "town-1", town.url)
+    watcher.scan()
+    again, watcher = town.service()
+    watcher.open_first()
+    assert version_of(again) == first
+    assert town.cached == {first}
+
+
 def test_versions_that_nobody_has_mounted_leave_the_cache(town: Town) -> None:
     made = [town.push()]
     registry, watcher = town.service()
@@ -97,7 +112,7 @@ def test_a_store_that_is_gone_stops_no_service(town: Town) -> None:
     assert watcher.scan() == []
     (refused,) = registry.refused
     assert "file://" not in refused.reason
-    assert "is missing in the store" in refused.reason
+    assert refused.reason == "it cannot be served from its store; the log of the service says why"
     watcher.scan(drop_missing=True)
     assert version_of(registry) == version
     shutil.move(town.folder / "away", town.folder / "store")
