@@ -14,6 +14,7 @@ from service.maps.byte_planes import read_records
 from service.maps.content import BundleContent
 from service.maps.map import Map
 from service.maps.reader import MapBundle
+from service.maps.writer import sha256_of
 
 
 def content_of(bundle: MapBundle) -> BundleContent:
@@ -121,10 +122,13 @@ def read_statistics(bundle: MapBundle) -> NDArray[Any]:
         bundle: a bundle that stores sums.
 
     Raises:
-        BundleError: the file cannot be read, has another type, or holds an empty voxel or a sum that is not finite.
+        BundleError: the file is damaged or cannot be read, has another type, or holds an empty voxel or a sum that is not finite.
     """
+    file = bundle.path / parts.STATISTICS_FILE
     try:
-        found = read_records(bundle.path / parts.STATISTICS_FILE, VOXEL)
+        if sha256_of(file) != bundle.manifest.files[parts.STATISTICS_FILE].sha256:
+            raise _defect(bundle, "the hash does not match the manifest")
+        found = read_records(file, VOXEL)
     except (OSError, ValueError) as error:
         raise _defect(bundle, f"not a valid file of voxels ({error})") from error
     if not all(np.isfinite(found[name]).all() for name in ("sums", "brightness")) or not (found["points"] > 0).all():

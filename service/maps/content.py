@@ -15,7 +15,7 @@ PLACES_FILE, VIEWS_FILE = "places.npy", "views.npy"
 ENCODER_FILE = "encoder.onnx"
 CALIBRATION_FILE, PREVIEW_FILE = "calibration.json", "preview.webp"
 CLOUD_FOLDER = "cloud"
-#: Voxel statistics for merging and updating maps. The service only checks the hash of this file.
+#: Voxel statistics for merging and updating maps, which check the hash of this file. The service only checks its size.
 STATISTICS_FILE = "voxels.zst"
 #: Files that the service does not read. A folder that only serves may lack them (``maps/store``).
 NOT_SERVED = frozenset({STATISTICS_FILE, PREVIEW_FILE})

@@ -24,7 +24,7 @@ def require_files(path: Path, manifest: Manifest, needed: Iterable[str], *, veri
         path: the bundle's folder.
         manifest: its manifest.
         needed: files that the manifest must list.
-        verify: compare the hash of every file. Sizes are always compared.
+        verify: compare the hash of every file that the service reads. Sizes are always compared.
 
     Raises:
         BundleError: a file is missing, damaged or outside the folder.
@@ -40,7 +40,8 @@ def require_files(path: Path, manifest: Manifest, needed: Iterable[str], *, veri
             raise defect(file, "missing, or outside the bundle")
         try:
             size = file.stat().st_size
-            found = sha256_of(file) if verify and size == entry.size else entry.sha256
+            is_compared = verify and size == entry.size and name not in parts.NOT_SERVED
+            found = sha256_of(file) if is_compared else entry.sha256
         except OSError as error:  # for example, somebody removes the bundle meanwhile
             raise defect(file, f"cannot be read ({error.strerror})") from error
         if size != entry.size:

@@ -36,8 +36,8 @@ class MapBundle(Map):
 
         Args:
             path: the bundle's folder.
-            verify: compare the hash of every file with the manifest, and check every index of the cloud and of the inverted file.
-                Sizes and shapes are always checked.
+            verify: compare the hash of every file that the service reads with the manifest, and check every index of the cloud and of
+                the inverted file. Sizes and shapes are always checked.
 
         Raises:
             BundleError: the bundle is missing, damaged, of another format, or inconsistent. The message names the file and
