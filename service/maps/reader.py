@@ -31,13 +31,14 @@ class MapBundle(Map):
     cloud: SurfelMap | None
 
     @classmethod
-    def open(cls, path: Path, *, verify: bool = True) -> "MapBundle":
+    def open(cls, path: Path, *, verify: bool = True, compare_hashes: bool = True) -> "MapBundle":
         """Open a bundle that ``write_bundle`` wrote. It may lack the files that the service does not read.
 
         Args:
             path: the bundle's folder.
             verify: compare the hash of every file that the service reads with the manifest, and check every index of the cloud and of
                 the inverted file. Sizes and shapes are always checked.
+            compare_hashes: False leaves out the hashes, because the caller has compared them.
 
         Raises:
             BundleError: the bundle is missing, damaged, of another format, or inconsistent. The message names the file and
@@ -50,7 +51,7 @@ class MapBundle(Map):
                 "or build the map without --tile-m",
                 field=FILE,
             )
-        require_files(path, manifest, _NEEDED, verify=verify)
+        require_files(path, manifest, _NEEDED, verify=verify and compare_hashes)
         document = read_file(path / streets.FILE) if streets.FILE in manifest.files else None
         bundle = cls(
             path=path,

@@ -66,6 +66,13 @@ class TileSource(Protocol):
             tiles: the most probable first. They replace those of the call before.
         """
 
+    def is_compared(self, tile: Tile) -> bool:
+        """Return whether this process has compared the hashes of a tile's files, for example while it fetched them.
+
+        Args:
+            tile: as the manifest of the map lists it.
+        """
+
     def used(self, tile: Tile) -> None:
         """Take note that an open tile is in use. It is called for every query.
 
@@ -98,6 +105,14 @@ class LocalTiles:
         Args:
             tiles: tiles of the map.
         """
+
+    def is_compared(self, tile: Tile) -> bool:  # noqa: ARG002 - as of TileSource
+        """Return False: nobody has compared the hashes yet.
+
+        Args:
+            tile: a tile of the map.
+        """
+        return False
 
     def used(self, tile: Tile) -> None:
         """Do nothing, because no tile is deleted.
@@ -311,7 +326,7 @@ class OpenTiles:
         raise AssertionError  # the last turn returns or raises
 
     def _opened_from(self, folder: Path, tile: Tile, *, verify: bool) -> MapBundle:
-        bundle = MapBundle.open(folder, verify=verify)
+        bundle = MapBundle.open(folder, verify=verify, compare_hashes=not self._source.is_compared(tile))
         if bundle.manifest.version != tile.version:
             raise defect(folder / manifest.FILE, f"version {bundle.manifest.version}, but the map lists {tile.version}")
         if different := differences(bundle.manifest, self._manifest):

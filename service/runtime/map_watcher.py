@@ -41,6 +41,9 @@ class _LoggedTiles:
     def expect(self, tiles: Sequence[Tile]) -> None:
         self._tiles.expect(tiles)
 
+    def is_compared(self, tile: Tile) -> bool:
+        return self._tiles.is_compared(tile)
+
     def used(self, tile: Tile) -> None:
         self._tiles.used(tile)
 

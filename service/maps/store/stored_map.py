@@ -126,6 +126,7 @@ class StoreTiles:
         self._expecting = threading.Lock()
         self._fetches_ahead = False
         self._used_s: dict[str, float] = {}
+        self._compared = set[str]()  # versions of the tiles that this process has fetched
         self._shared: Mapping[str, Path] | None = None
 
     def folder(self, tile: Tile) -> Path:
@@ -172,6 +173,14 @@ class StoreTiles:
             ):  # the request that needs the tile fetches it again, and says what is wrong
                 self.folder(tile)
 
+    def is_compared(self, tile: Tile) -> bool:
+        """Return whether this object has fetched a tile, and compared the hashes meanwhile.
+
+        Args:
+            tile: of the map's manifest.
+        """
+        return tile.version in self._compared
+
     def used(self, tile: Tile) -> None:
         """Mark a tile as used, so that the bound of the cache deletes others first. It costs nothing more than once a minute.
 
@@ -196,6 +205,7 @@ class StoreTiles:
         self._cache.reserve(into, {name: entry.size for name, entry in files.items()})
         fetch_files(self._remote, f"{tile.folder}/", files, into)
         (into / FILE).write_bytes(data)
+        self._compared.add(tile.version)
 
     def _shared_by_hash(self) -> Mapping[str, Path]:
         """Return the shared files of the map by their hash. A tile has copies of some, which are hard links in the cache."""

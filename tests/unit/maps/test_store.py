@@ -481,6 +481,22 @@ def test_threads_fetch_a_tile_once(
     assert len(names) == len(set(names)) > 0
 
 
+def test_who_fetched_a_tile_has_compared_its_hashes(town: Path, file_url: str, cache: TileCache) -> None:
+    push(town, file_url)
+    found, version, manifest, tiles = stored(file_url, cache)
+    tile = manifest.tiles[0]
+    assert not tiles.is_compared(tile)
+    folder = tiles.folder(tile)
+    assert tiles.is_compared(tile)
+    again = found.tiles(version)
+    assert not again.is_compared(tile)
+    views = bytearray((folder / "views.npy").read_bytes())
+    views[-1] ^= 1
+    (folder / "views.npy").write_bytes(views)
+    with pytest.raises(BundleError, match=r"views.npy: the hash does not match the manifest"):
+        TiledMap.open(version, source=again).tiles.get(0)
+
+
 def test_expected_tiles_are_fetched_in_the_background(town: Path, file_url: str, cache: TileCache) -> None:
     push(town, file_url)
     found, _, manifest, tiles = stored(file_url, cache)

@@ -162,9 +162,7 @@ def test_regions_are_kept_while_their_tiles_are_open(tiled: TiledMap) -> None:
 
 def test_threads_open_a_tile_once(tiled: TiledMap, monkeypatch: pytest.MonkeyPatch) -> None:
     opened, opening = [], MapBundle.open
-    monkeypatch.setattr(
-        MapBundle, "open", lambda folder, *, verify: opened.append(folder) or opening(folder, verify=verify)
-    )
+    monkeypatch.setattr(MapBundle, "open", lambda folder, **how: opened.append(folder) or opening(folder, **how))
     threads = [threading.Thread(target=tiled.tiles.get, args=(0,)) for _ in range(8)]
     for thread in threads:
         thread.start()
