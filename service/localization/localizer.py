@@ -3,8 +3,6 @@
 from dataclasses import replace
 
 import numpy as np
-from jaxtyping import Float64
-from numpy.typing import NDArray
 
 from service.confidence.decision import decision_of, require_promise
 from service.confidence.features import evidence_of, require_features
@@ -18,7 +16,7 @@ from service.retrieval.encoder import Encoder, Provider
 from service.retrieval.hypotheses import ClusterSettings
 from service.retrieval.query import Query
 from service.retrieval.retrieve import Frame, look_up, require_encoder_of, retrieve
-from service.retrieval.starts import poses_of_matches
+from service.retrieval.starts import start_positions_m
 from service.timing import stage, timed_request
 
 
@@ -133,9 +131,8 @@ class Localizer:
             RequestError: the calibration does not support such a low false-accept rate.
         """
         query = frames[0].query
-        bundle = self.bundle.around(
-            lambda: _starts_m(self.bundle, frames, predicted)
-        )  # of a tiled map, the tiles of this query
+        # Of a tiled map, only the tiles of this query take part.
+        bundle = self.bundle.around(lambda: start_positions_m(frames, predicted, self.bundle.manifest.lidar_height_m))
         cloud = bundle.cloud if query.refine else None
         require_promise(bundle.calibration if query.refine else None, query)
         # 1. Retrieval: the most similar places, clusters of the views, and the paper's K-NN vote over the streets.
@@ -163,13 +160,3 @@ class Localizer:
         """
         # 5. Reasons and spread if the answer is not LOCALIZED. Then the answer, and a check that all its numbers are finite.
         return compose(self.bundle, frames, found, self.extent)
-
-
-def _starts_m(
-    bundle: Map, frames: tuple[Frame, ...], predicted: tuple[Transform, ...]
-) -> Float64[NDArray[np.float64], "n 3"]:
-    """Return the positions that a registration may start from, map frame, m: predicted ones, then those of the most similar views."""
-    poses = poses_of_matches(frames, bundle.manifest.lidar_height_m)
-    similarity = np.concatenate([frame.matches.similarity for frame in frames])
-    similar = poses[np.argsort(-similarity, kind="stable"), :3, 3]
-    return np.concatenate([np.array([T[:3, 3] for T in predicted]).reshape(-1, 3), similar])

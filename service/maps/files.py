@@ -68,7 +68,7 @@ def read_file(path: Path) -> bytes:
 
 
 def map_array(path: Path, *, expected: np.dtype[Any] | None) -> NDArray[Any]:
-    """Map an array into memory.
+    """Map an array into memory; return it in the shape of the file, (n,) if a type is expected.
 
     Args:
         path: NPY file.

@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float64
 from numpy.typing import NDArray
 
-from service.geometry.rigid import inverse
+from service.geometry.rigid import Transform, inverse
 from service.registration.register import Start
 from service.retrieval.prior import Prior
 from service.retrieval.retrieve import Frame
@@ -83,6 +83,22 @@ def _chosen(
         order = np.argsort(-similarity, kind="stable")
         kept = _distinct(order[allowed[order]], poses[:, :2, 3], heading, kept, most, settings)
     return kept
+
+
+def start_positions_m(
+    frames: tuple[Frame, ...], predicted: tuple[Transform, ...], lidar_height_m: float
+) -> Float64[NDArray[np.float64], "n 3"]:
+    """Return the positions of the reference that a registration may start from, map frame, m, the most important first.
+
+    Args:
+        frames: image pairs, the reference first.
+        predicted: poses T_map_camera of the reference from odometry. They come first.
+        lidar_height_m: height of the places' LiDAR above the ground, m.
+    """
+    poses = poses_of_matches(frames, lidar_height_m)
+    similarity = np.concatenate([frame.matches.similarity for frame in frames])
+    similar = poses[np.argsort(-similarity, kind="stable"), :3, 3]
+    return np.concatenate([np.array([T[:3, 3] for T in predicted]).reshape(-1, 3), similar])
 
 
 def poses_of_matches(frames: tuple[Frame, ...], lidar_height_m: float) -> Float64[NDArray[np.float64], "n 4 4"]:
