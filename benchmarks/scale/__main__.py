@@ -80,7 +80,7 @@ def main() -> None:
     if min(arguments.sizes) < 10_000:
         parser.error(f"--sizes: {min(arguments.sizes)} is too small; give 10000 or more")
     arguments.work.mkdir(parents=True, exist_ok=True)
-    told = " ".join(sys.argv[1:])
+    told = " ".join(_shown(argument) for argument in sys.argv[1:])
     report = Report("scale", "make bench-scale" + (f' ARGS="{told}"' if told else ""))
     if tuple(arguments.sizes) != SIZES or set(arguments.only) != set(PARTS):
         report.keep_others()
@@ -99,6 +99,14 @@ def main() -> None:
     if "town" in arguments.only:
         town_rows(report, Runs(arguments.work, ENCODER))
         report.write()
+
+
+def _shown(argument: str) -> str:
+    """Return an argument for the report, which names no folder of this machine outside of the repository."""
+    path = Path(argument)
+    if not path.is_absolute():
+        return argument
+    return str(path.relative_to(ROOT)) if path.is_relative_to(ROOT) else f".../{path.name}"
 
 
 def _search(report: Report, work: Path, sizes: tuple[int, ...]) -> None:
