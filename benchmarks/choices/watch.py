@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from model_training.datasets.dataset import Dataset
 from model_training.mapping.settings import BuildSettings
-from model_training.mapping.survey import fan, fan_views, kept_scans, levelled_scans, rows_seen_by
+from model_training.mapping.survey import fan, fan_views, kept_scans, levelled_scans, sampled_survey
 from model_training.simulation.plan import QueryPlan, SimulationPlan
 from model_training.training.recipe import WATCH_SEEDS
 from service.geometry.rigid import heading_of_body
@@ -68,7 +68,7 @@ class WatchCity:
         self.dataset, self.grid = dataset, grid
         self.settings = BuildSettings(name="watch", calibration=None)
         self.poses, self.kept = kept_scans(dataset, self.settings)
-        self.rows_seen = rows_seen_by(dataset, self.kept, grid, self.settings)
+        self.rows_seen = sampled_survey(dataset, self.kept, grid, self.settings)[0]
         self.sets = dataset.query_sets(with_truth=True)
 
     @cached_property

@@ -13,7 +13,7 @@ from model_training.mapping.align_survey import aligned
 from model_training.mapping.passes import Vote
 from model_training.mapping.places import Drive, Places, gathered
 from model_training.mapping.settings import BuildSettings
-from model_training.mapping.survey import rows_seen_by
+from model_training.mapping.survey import sampled_survey
 from model_training.mapping.tiles import TilePart
 from model_training.mapping.voxel_map import VoxelMap
 from model_training.mapping.work import Arrays, Work
@@ -50,9 +50,9 @@ class ResumedStages:
         Args:
             grid: the view grid.
         """
-        return self.work.part("rows", lambda: {"seen": rows_seen_by(self.dataset, self.kept, grid, self.settings)})[
-            "seen"
-        ]
+        return self.work.part(
+            "rows", lambda: {"seen": sampled_survey(self.dataset, self.kept, grid, self.settings)[0]}
+        )["seen"]
 
     def poses(self, given: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return T_map_lidar of all scans (n, 4, 4), aligned if the settings say so.

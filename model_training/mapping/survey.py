@@ -172,24 +172,6 @@ def clear_scan(dataset: Dataset, number: int, settings: BuildSettings) -> NDArra
     return points[remove_weather_noise(points[:, :3])] if settings.remove_weather else points
 
 
-def rows_seen_by(
-    dataset: Dataset, kept: NDArray[np.int64], grid: ViewGrid, settings: BuildSettings, *, sample: int = 100
-) -> NDArray[np.bool_]:
-    """Return which rows of the view grid the survey's LiDAR covers (rows,), as ``sampled_survey``.
-
-    Args:
-        dataset: the dataset with the survey.
-        kept: indices of the scans that become places (P,).
-        grid: the view grid.
-        settings: settings of the map.
-        sample: approximate number of scans in the sample.
-
-    Raises:
-        DatasetError: the LiDAR covers no row.
-    """
-    return sampled_survey(dataset, kept, grid, settings, sample=sample)[0]
-
-
 def sampled_survey(
     dataset: Dataset, kept: NDArray[np.int64], grid: ViewGrid, settings: BuildSettings, *, sample: int = 100
 ) -> tuple[NDArray[np.bool_], float]:
