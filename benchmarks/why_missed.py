@@ -271,6 +271,14 @@ WHY_MISSED["sequence.landmark.within_1_m"] = Reason(
     "lower the confidence. Tried: a better encoder (decision 0154), depth structure (decision 0159; 50 -> 48). Next: a feature that "
     "tells a landmark from a repeated block",
 )
+WHY_MISSED["rigs.worst_ece"] = Reason(
+    0.12037037037037036,
+    "The worst family are the sparse rings of a spinning LiDAR. The calibration is not fitted on it and accepts none of its answers, of which "
+    "0.26 are right. Among the fitted families the worst is the D435 (rigs.worst_fitted_ece). See rigs.rings.ece and rigs.d435.ece",
+)
+WHY_MISSED["rigs.worst_within_1_m"] = Reason(
+    0.158, "The worst family is the OAK-D, a small stereo rig with a narrow view. See rigs.oak_d.within_1_m"
+)
 WHY_MISSED["town.build_minutes"] = Reason(
     21.560314383700096,
     "Ten tiles read 36,301 scans for a survey of 21,441, because the scans within 90 m of a tile measure its cloud."
