@@ -273,8 +273,8 @@ WHY_MISSED["sequence.landmark.within_1_m"] = Reason(
 )
 WHY_MISSED["rigs.worst_ece"] = Reason(
     0.12037037037037036,
-    "The worst family are the sparse rings of a spinning LiDAR. The calibration is not fitted on it and accepts none of its answers, of which "
-    "0.26 are right. Among the fitted families the worst is the D435 (rigs.worst_fitted_ece). See rigs.rings.ece and rigs.d435.ece",
+    "The worst family are the sparse rings of a spinning LiDAR. The calibration is not fitted on it and accepts none of its answers, of "
+    "which 0.26 are right. Among the fitted families the worst is the D435 (rigs.worst_fitted_ece). See rigs.rings.ece and rigs.d435.ece",
 )
 WHY_MISSED["rigs.worst_within_1_m"] = Reason(
     0.158, "The worst family is the OAK-D, a small stereo rig with a narrow view. See rigs.oak_d.within_1_m"
