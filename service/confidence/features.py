@@ -27,6 +27,7 @@ OTHER_PLACE_M, VOTE_M, VOTERS = 10.0, 5.0, 20
 _NEAREST = 5  # number of the most similar neighbours in ``pose_spread``
 _MOST_MARGIN = 12.0  # nats; largest margin, also used if there is no rival
 _MOST_PLACE_M = 10.0
+_LONE_ADVANTAGE = 0.3  # a typical value of right answers
 _LEAST_MAPPED = 0.05
 
 
@@ -76,6 +77,12 @@ class Evidence:
         """Horizontal distance of each neighbour from the answer, metres."""
         xy = self.best.T_map_camera[:2, 3]
         return np.array([np.hypot(*(place.position_m[:2] - xy)) for place in self.neighbours])
+
+    @property
+    def inlier_advantage(self) -> float:
+        """Inliers of the best candidate minus the median of its rivals; ``_LONE_ADVANTAGE`` without rivals."""
+        rivals = [rival.registered.inliers for rival in distinct_candidates(self.refined.candidates)[1:]]
+        return self.best.registered.inliers - float(np.median(rivals)) if rivals else _LONE_ADVANTAGE
 
     @property
     def similarity_margin(self) -> float:
@@ -137,7 +144,7 @@ class Feature:
 #: ``log_share`` has no weight, because it is a separate rule beside the confidence (``service.confidence.decision``, decision
 #: 0086). ``similarity`` has none, because it depends more on the kind of street than on the place. Real streets lie four
 #: standard deviations below simulated streets (decision 0137). The others without a weight gained nothing on rig families that
-#: were left out of the fit (decisions 0149 and 0159). They still serve ``reasons``.
+#: were left out of the fit (decisions 0149, 0159 and 0165). They still serve ``reasons``.
 TABLE: tuple[Feature, ...] = (
     Feature("margin", "nat", "support gap to the best rival", 1,
             lambda e: float(e.support_gaps[1:].min(initial=_MOST_MARGIN)), rivalry=True, ideal=True),
@@ -153,13 +160,21 @@ TABLE: tuple[Feature, ...] = (
     Feature("through", "1", "share of the mapped points behind the map's surfaces", -1,
             lambda e: e.best.scores["through"] / e.mapped_share, ideal=True),
     Feature("front", "1", "share of the mapped points in front of the map's surfaces", -1,
-            lambda e: e.best.scores["front"] / e.mapped_share, ideal=True),
+            lambda e: e.best.scores["front"] / e.mapped_share, weighted=False, ideal=True),
     Feature("shared_edges", "1", "share of the depth edges of image and map that the other one has too", 1,
             lambda e: e.best.scores["shared_edges"], weighted=False),
     Feature("upper_inliers", "1", "share of the points above vehicles and people that lie on the map", 1,
-            lambda e: e.best.scores["upper_inliers"], ideal=True),
+            lambda e: e.best.scores["upper_inliers"], weighted=False, ideal=True),
+    Feature("upper_front", "1", "share of the points above vehicles and people that lie in front of the map's surfaces", -1,
+            lambda e: e.refined.confirmation.upper_front, ideal=True),
     Feature("contrast", "1", "how much worse the depth fits if the map's image shifts by a few degrees", 1,
-            lambda e: e.best.scores["contrast"], ideal=True),
+            lambda e: e.refined.confirmation.contrast, ideal=True),
+    Feature("along_residual", "1", "how many times worse the depth fits 2 m further along the street", 1,
+            lambda e: e.refined.confirmation.along_residual, ideal=True),
+    Feature("along_edges", "1", "decrease of the shared depth edges 2 m further along the street", 1,
+            lambda e: e.refined.confirmation.along_edges, ideal=True),
+    Feature("inlier_advantage", "1", "share of inliers minus the median of the rivals", 1,
+            lambda e: e.inlier_advantage, rivalry=True, ideal=True),
     Feature("unmapped", "1", "share of the points where the map shows nothing", -1, lambda e: e.best.scores["unmapped"],
             weighted=False),
     Feature("log_sigma", "log m", "larger horizontal standard deviation of the registration", -1,

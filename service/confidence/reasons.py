@@ -49,11 +49,14 @@ GROUPS: tuple[tuple[str, tuple[str, ...], str], ...] = (
     ("baseline", ("log_noise", "points", "log_sigma"), "check the stereo baseline (depth.baseline_m) and the noise of the depth"),
     (
         "traffic in the map",
-        ("through", "front", "mapped_inliers", "inliers", "upper_inliers", "shared_edges", "contrast", "unmapped", "likelihood"),
+        ("through", "front", "upper_front", "mapped_inliers", "inliers", "upper_inliers", "shared_edges", "contrast", "unmapped",
+         "likelihood"),
         "build the map with the traffic vote, and look for changes since the survey",
     ),
     (
-        "calibration", ("margin", "similarity_margin", "votes", "entropy", "pose_spread", "residual", "edges", "place_m"),
+        "calibration",
+        ("margin", "inlier_advantage", "similarity_margin", "votes", "entropy", "pose_spread", "residual", "edges", "place_m",
+         "along_residual", "along_edges"),
         "the map was calibrated on other queries; calibrate it on queries like these (streetfix calibrate)",
     ),
 )  # fmt: skip

@@ -27,6 +27,7 @@ from service.retrieval.prior import Prior
 from service.retrieval.retrieve import Frame
 from service.retrieval.starts import StartSettings, starts_from
 from service.scoring.candidates import Candidate, Refined
+from service.scoring.confirmation import confirm
 from service.scoring.measured import MeasuredFrame, measure, merged_points
 from service.scoring.photometry import BrightnessScorer, PhotometrySettings
 from service.scoring.similarity import similarity_of
@@ -142,7 +143,7 @@ def refine(
             cloud, points, candidates[0].registered, reference.views.height_m, settings.registration, settings.around
         )
         candidates[0] = scorer.select_local_optimum(candidates[0], near)
-    # 4. Adjustment of the best pose along the rays, and its covariance.
+    # 4. Adjustment of the best pose along the rays, its covariance, and its comparison with poses next to it.
     best = candidates[0].registered
     adjusted = adjust(raycasters.at(best.camera_m), [each.picture for each in measured], best, settings.rays)
     if adjusted is None:
@@ -171,6 +172,7 @@ def refine(
         registration_covariance=of_registration,
         points=len(points),
         disagreement=disagreement(best.information, scatter),
+        confirmation=confirm(cloud, scorer.structure, best),
         covariance_at=covariance_at,
     )
 

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from service.geometry.rigid import Transform
 from service.registration.register import Registered
+from service.scoring.confirmation import Confirmation
 
 #: Two candidates are rivals beyond this distance or this angle. Adjacent positions on one street are not rivals.
 RIVAL_M, RIVAL_RAD = 3.0, float(np.deg2rad(30.0))
@@ -47,6 +48,7 @@ class Refined:
         registration_covariance: the part of it without the errors of the survey and of a stereo pair's rectification.
         points: number of registered points, over all frames.
         disagreement: variance inflation at the best pose: how much the image patches disagree about it, relative to their noise.
+        confirmation: comparison of the best pose with poses next to it.
         covariance_at: function that computes the covariance of a candidate without ray adjustment: of every one but the best.
     """
 
@@ -55,6 +57,7 @@ class Refined:
     registration_covariance: Float64[NDArray[np.float64], "6 6"]
     points: int
     disagreement: float
+    confirmation: Confirmation
     covariance_at: Callable[[Candidate], Float64[NDArray[np.float64], "6 6"]]
 
     @property

@@ -9,7 +9,7 @@ numbers differ: noisy depth has less contrast, and a narrow view has fewer edges
 from dataclasses import astuple, dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float32
+from jaxtyping import Bool, Float32, Float64
 from numpy.typing import NDArray
 
 from service.geometry.camera import PinholeCamera
@@ -36,7 +36,7 @@ INLIER_SIGMAS, MOST_SIGMAS = 2.0, 3.0
 #: Shifts of the map's image for the contrast, pixels: 5.7 and 8.6 degrees at the centre, to each side.
 SHIFTS_PX = (-6, -4, 4, 6)
 #: Pixels, or edges, at which a number counts half. With fewer, inliers tend to 0.5, and contrast and shared edges to 0.
-_HALF_PIXELS, _HALF_EDGES = 20.0, 10.0
+HALF_PIXELS, _HALF_EDGES = 20.0, 10.0
 #: Smallest divisor of a depth that is corrected by a disparity offset.
 _LEAST_STRETCH = 0.05
 
@@ -109,6 +109,28 @@ class StructureImage:
     edges: DepthEdges
 
 
+def rendered(
+    cloud: Cloud, R_map_camera: Rotation, camera_m: Float64[NDArray[np.float64], " 3"]
+) -> Float32[NDArray[np.float32], "H W"]:
+    """Return the depth of the map, seen by ``CAMERA``, m; 0 where nothing is mapped.
+
+    Args:
+        cloud: cloud of the map.
+        R_map_camera: rotation from the camera's optical frame to the map frame.
+        camera_m: position of the camera, map frame, m.
+    """
+    surfels = cloud.at(camera_m)
+    return render(
+        surfels.surfels,
+        surfels.tiles,
+        tile_m=TILE_M,
+        T_map_camera=transform_from(R_map_camera, camera_m - surfels.origin_m),
+        camera=CAMERA,
+        size_m=SURFEL_M,
+        reach_m=REACH_M,
+    )
+
+
 def depth_edges(z_m: Float32[NDArray[np.float32], "H W"]) -> DepthEdges:
     """Find the depth edges of an image.
 
@@ -171,53 +193,97 @@ def compare(
         scale: factor from measured to true depth.
         offset: disparity offset, px.
     """
-    # A large negative offset puts a far point behind infinity. The limit keeps the depth finite; such a point is no inlier.
-    stretch = np.maximum(1 + np.float32(offset) * image.per_offset, np.float32(_LEAST_STRETCH))
-    z = image.z_m * np.float32(scale) / stretch
-    residual = _residual(image, z, rendered_m)
-    own, count = _mean(residual, image.raised & (rendered_m > 0))
-    shifted = min(_shifted(image, z, rendered_m, by) for by in SHIFTS_PX)
+    z = corrected(image, scale=scale, offset=offset)
+    sigmas = residual_sigmas(image, z, rendered_m)
     upper = image.upper & (rendered_m > 0)
-    inliers = float((residual[upper] < INLIER_SIGMAS / MOST_SIGMAS).sum())
+    inliers = float((np.abs(sigmas[upper]) < INLIER_SIGMAS).sum())
     return Structure(
-        shared_edges=_shared_edges(image.edges, depth_edges(rendered_m)),
-        upper_inliers=(inliers + 0.5 * _HALF_PIXELS) / (float(upper.sum()) + _HALF_PIXELS),
-        contrast=(shifted - own) * count / (count + _HALF_PIXELS),
+        shared_edges=shared_edges(image.edges, depth_edges(rendered_m)),
+        upper_inliers=(inliers + 0.5 * HALF_PIXELS) / (float(upper.sum()) + HALF_PIXELS),
+        contrast=contrast(image, z, rendered_m),
     )
 
 
-def _residual(
+def corrected(image: StructureImage, *, scale: float, offset: float) -> Float32[NDArray[np.float32], "H W"]:
+    """Return the depth of a query with the scale and the disparity offset of its registration, m.
+
+    Args:
+        image: depth of the query.
+        scale: factor from measured to true depth.
+        offset: disparity offset, px.
+    """
+    # A large negative offset puts a far point behind infinity. The limit keeps the depth finite; such a point is no inlier.
+    stretch = np.maximum(1 + np.float32(offset) * image.per_offset, np.float32(_LEAST_STRETCH))
+    z_m: Float32[NDArray[np.float32], "H W"] = image.z_m * np.float32(scale) / stretch
+    return z_m
+
+
+def residual_sigmas(
     image: StructureImage, z_m: Float32[NDArray[np.float32], "H W"], rendered_m: Float32[NDArray[np.float32], "H W"]
 ) -> Float32[NDArray[np.float32], "H W"]:
-    """Residual of each pixel: 0 on the map's surface, 1 from ``MOST_SIGMAS`` on."""
-    sigmas = np.abs(z_m - rendered_m) / image.sigma_m
-    residual: Float32[NDArray[np.float32], "H W"] = np.minimum(sigmas / np.float32(MOST_SIGMAS), np.float32(1))
-    return residual
+    """Return the residual of each pixel, in standard deviations; negative in front of the map's surface.
+
+    Args:
+        image: depth of the query.
+        z_m: its corrected depth, m.
+        rendered_m: depth of the map, m; 0 where nothing is mapped. The residual has no meaning there.
+    """
+    sigmas: Float32[NDArray[np.float32], "H W"] = (z_m - rendered_m) / image.sigma_m
+    return sigmas
 
 
-def _mean(residual: Float32[NDArray[np.float32], "H W"], at: Bool[NDArray[np.bool_], "H W"]) -> tuple[float, float]:
-    """Mean residual of some pixels (1 for none) and their number."""
+def mean_residual(
+    image: StructureImage, z_m: Float32[NDArray[np.float32], "H W"], rendered_m: Float32[NDArray[np.float32], "H W"]
+) -> tuple[float, float]:
+    """Return the mean residual of the pixels that are no ground, and their number.
+
+    A pixel on the map's surface counts 0, and one that is ``MOST_SIGMAS`` or more away counts 1. The mean is 1 without such pixels.
+
+    Args:
+        image: depth of the query.
+        z_m: its corrected depth, m.
+        rendered_m: depth of the map, m; 0 where nothing is mapped.
+    """
+    at = image.raised & (rendered_m > 0)
     count = float(at.sum())
-    return (float(residual[at].mean()) if count else 1.0), count
+    if not count:
+        return 1.0, 0.0
+    sigmas = np.abs(residual_sigmas(image, z_m, rendered_m)[at])
+    return float(np.minimum(sigmas / np.float32(MOST_SIGMAS), np.float32(1)).mean()), count
 
 
-def _shifted(
-    image: StructureImage,
-    z_m: Float32[NDArray[np.float32], "H W"],
-    rendered_m: Float32[NDArray[np.float32], "H W"],
-    by: int,
+def contrast(
+    image: StructureImage, z_m: Float32[NDArray[np.float32], "H W"], rendered_m: Float32[NDArray[np.float32], "H W"]
 ) -> float:
-    """Mean residual if the map's image shifts by some pixels to the right; 1 if nothing of it is in view then."""
-    shifted = np.zeros_like(rendered_m)
+    """Return by how much the mean residual increases if the map's image shifts by ``SHIFTS_PX``: the smallest of all shifts.
+
+    Args:
+        image: depth of the query.
+        z_m: its corrected depth, m.
+        rendered_m: depth of the map, m; 0 where nothing is mapped.
+    """
+    own, count = mean_residual(image, z_m, rendered_m)
+    shifted = min(mean_residual(image, z_m, _shifted(rendered_m, by))[0] for by in SHIFTS_PX)
+    return (shifted - own) * count / (count + HALF_PIXELS)
+
+
+def _shifted(image: Float32[NDArray[np.float32], "H W"], by: int) -> Float32[NDArray[np.float32], "H W"]:
+    """Shift an image by some pixels to the right; 0 where nothing of it is in view then."""
+    shifted = np.zeros_like(image)
     if by > 0:
-        shifted[:, by:] = rendered_m[:, :-by]
+        shifted[:, by:] = image[:, :-by]
     else:
-        shifted[:, :by] = rendered_m[:, -by:]
-    return _mean(_residual(image, z_m, shifted), image.raised & (shifted > 0))[0]
+        shifted[:, :by] = image[:, -by:]
+    return shifted
 
 
-def _shared_edges(one: DepthEdges, other: DepthEdges) -> float:
-    """Share of the edges of two images that the other image has too, where both have a depth."""
+def shared_edges(one: DepthEdges, other: DepthEdges) -> float:
+    """Return the share of the edges of two images that the other image has too, where both have a depth.
+
+    Args:
+        one: edges of an image.
+        other: edges of another image.
+    """
     both = one.known & other.known
     here, there = one.rising & both, other.rising & both
     shared = (here & other.near).sum() + (there & one.near).sum()
@@ -231,14 +297,18 @@ class StructureScorer:
         cloud: cloud of the map.
         measured: frames of the query, the reference first.
         weights: weights of the numbers.
+
+    Attributes:
+        measured: the frames that have points.
+        images: depth of each of these frames.
     """
 
     name = "structure"
 
     def __init__(self, cloud: Cloud, measured: tuple[MeasuredFrame, ...], weights: StructureWeights) -> None:
         self._cloud, self._weights = cloud, weights
-        self._measured = [each for each in measured if len(each.points)]
-        self._images = [
+        self.measured = tuple(each for each in measured if len(each.points))
+        self.images = tuple(
             structure_image(
                 each.blocks,
                 each.frame.R_level_camera,
@@ -246,8 +316,8 @@ class StructureScorer:
                 noise=each.frame.noise,
                 focal_baseline_px_m=each.picture.focal_baseline_px_m,
             )
-            for each in self._measured
-        ]
+            for each in self.measured
+        )
 
     def score(self, poses: tuple[Registered, ...]) -> Scores:
         """Return the score of each pose; details are the numbers of ``Structure``, means over the frames that have points.
@@ -260,18 +330,8 @@ class StructureScorer:
 
     def _structure(self, pose: Registered) -> NDArray[np.float64]:
         found = []
-        for image, each in zip(self._images, self._measured, strict=True):
+        for image, each in zip(self.images, self.measured, strict=True):
             own = each.pose(pose)
-            cloud = self._cloud.at(own.camera_m)
-            T = transform_from(own.R_map_level @ each.frame.R_level_camera, own.camera_m - cloud.origin_m)
-            rendered_m = render(
-                cloud.surfels,
-                cloud.tiles,
-                tile_m=TILE_M,
-                T_map_camera=T,
-                camera=CAMERA,
-                size_m=SURFEL_M,
-                reach_m=REACH_M,
-            )
+            rendered_m = rendered(self._cloud, own.R_map_level @ each.frame.R_level_camera, own.camera_m)
             found.append(astuple(compare(image, rendered_m, scale=own.scale, offset=own.offset)))
         return np.asarray(np.mean(found, axis=0), np.float64)

@@ -14,11 +14,14 @@ from service.maps.calibration import read_calibration
 from service.retrieval.hypotheses import Hypothesis
 from service.retrieval.knn import Neighbour
 from service.scoring.candidates import Refined
+from service.scoring.confirmation import Confirmation
+
+CONFIRMATION = Confirmation(upper_front=0.03, contrast=0.2, along_residual=1.7, along_edges=0.1)
 
 
 def refined(*candidates, covariance=None, points=1500, disagreement=1.0):
     own = np.eye(6) if covariance is None else covariance
-    return Refined(candidates, own + np.eye(6), own, points, disagreement, lambda _: np.eye(6))
+    return Refined(candidates, own + np.eye(6), own, points, disagreement, CONFIRMATION, lambda _: np.eye(6))
 
 
 def neighbour(x, similarity=0.5, *, y=0.0, z=0.0):
@@ -67,6 +70,10 @@ def weighed(candidate, frame):
         ("mapped_inliers", 0.7 / 0.9),
         ("measured", 0.75),
         ("place_m", 1.5),
+        ("upper_front", 0.03),
+        ("contrast", 0.2),
+        ("along_residual", 1.7),
+        ("along_edges", 0.1),
     ],
 )
 def test_features_of_the_best_candidate_are_unchanged(candidate, weighed, name, expected):
@@ -124,6 +131,20 @@ def test_the_share_is_the_best_ones_among_all_that_exclude_each_other(candidate,
     near = [candidate(support, xyz=(20 * k + 1, 0, 1.5)) for k, support in enumerate(supports)]
     for candidates in (apart, [*apart, *near]):
         assert weighed(candidates=tuple(candidates))["log_share"] == pytest.approx(np.log(share))
+
+
+def test_the_inlier_advantage_is_over_the_median_rival(candidate, weighed):
+    """Another frame of the same street is no rival. Without a rival the value is that of a usual right answer."""
+
+    def with_inliers(inliers, x):
+        found = candidate(xyz=(x, 0, 1.5))
+        return replace(found, registered=replace(found.registered, inliers=inliers))
+
+    best, same = with_inliers(0.7, 0), with_inliers(0.69, 1)
+    rivals = [with_inliers(inliers, 20.0 * (k + 1)) for k, inliers in enumerate((0.5, 0.4, 0.2))]
+    assert weighed(candidates=(best, same, *rivals))["inlier_advantage"] == pytest.approx(0.3)
+    assert weighed(candidates=(best, same, rivals[0]))["inlier_advantage"] == pytest.approx(0.2)
+    assert weighed(candidates=(best, same))["inlier_advantage"] == 0.3
 
 
 def test_the_similarity_margin_is_against_the_best_other_place(weighed):
