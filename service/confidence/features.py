@@ -245,6 +245,7 @@ def require_features(calibration: Calibration | None, path: str) -> None:
     """
     if calibration is not None and calibration.names != FEATURES:
         raise BundleError(
-            f"{path}: the confidence features are not those of this release ({', '.join(FEATURES)}); build the map again",
+            f"{path}: the confidence features are not those of this release ({', '.join(FEATURES)}); renew the calibration with "
+            "`streetfix calibrate --map MAP --calibration stock`, or build the map again",
             field="calibration.json",
         )
