@@ -21,8 +21,8 @@ from benchmarks.native import plain
 from model_training.datasets.dataset import Dataset, QueryFrame
 from service.geometry.rigid import R_BODY_OPTICAL
 from service.imaging import level
-from service.imaging.gather import gather
 from service.imaging.png16 import read_grey16
+from service.imaging.resample import resample
 from service.imaging.view_grid import ViewGrid
 from service.localization.localizer import Localizer
 from service.maps.reader import MapBundle
@@ -81,14 +81,14 @@ def _of_imaging(query: Query, grid: ViewGrid, file: bytes) -> dict[str, Pair]:
     ground = (depth_m, camera, R, level.USUAL_HEIGHT_M, level.HEIGHT_PRIOR_M)
     np.testing.assert_allclose(level._fit_ground(*ground), plain.fit_ground(*ground), rtol=1e-6, atol=1e-6)
     view = (rgb, depth_m, camera, R_BODY_OPTICAL.T, grid.widened(turns_on(grid)[-1]))
-    _require_same(gather(*view), plain.gathered(*view))
+    _require_same(resample(*view), plain.resampled(*view))
     noise = inverse_depth_noise(depth_m).total
     np.testing.assert_allclose(noise, plain.noise_of(depth_m), rtol=1e-5)
     thinned = blocks_of(depth_m, camera, points, noise=noise)
     _require_same((thinned.z_m,), (plain.blocks(depth_m, points, noise),))
     found = {
         "level.py: one fit of the ground": _both(lambda: level._fit_ground(*ground), lambda: plain.fit_ground(*ground)),
-        "gather.py: one wide view": _both(lambda: gather(*view), lambda: plain.gathered(*view)),
+        "resample.py: one wide view": _both(lambda: resample(*view), lambda: plain.resampled(*view)),
         "points.py: noise": _both(lambda: inverse_depth_noise(depth_m), lambda: plain.noise_of(depth_m)),
         "points.py: blocks": _both(
             lambda: blocks_of(depth_m, camera, points, noise=noise), lambda: plain.blocks(depth_m, points, noise)
@@ -108,7 +108,7 @@ def _of_imaging(query: Query, grid: ViewGrid, file: bytes) -> dict[str, Pair]:
 def _of_registration(localizer: Localizer, cloud: SurfelMap, query: Query) -> dict[str, Pair]:
     """One solver step of all starts; then the rays from the most similar start, and one step of their adjustment."""
     settings, lidar_height_m = localizer.refining, localizer.bundle.manifest.lidar_height_m
-    frame = localizer.look_up(query)
+    frame = localizer.encode_and_search(query)
     measured = measure((frame,), settings.points, focal_baseline_px_m=FOCAL_BASELINE_PX_M, is_rig=False)
     points = merged_points(measured).thinned(settings.registration.coarse_points)
     starts = starts_from((frame,), None, lidar_height_m=lidar_height_m, settings=settings.starts)

@@ -20,8 +20,8 @@ from service.errors import StreetfixError
 from service.geometry.camera import PinholeCamera
 from service.geometry.rigid import R_BODY_OPTICAL, rotation_x, rotation_y, rotation_z, transform_from
 from service.imaging import depth16
-from service.imaging.gather import gather
 from service.imaging.level import level_camera
+from service.imaging.resample import resample
 from service.imaging.view_grid import ViewGrid
 from service.registration.kernel import (
     STATE,
@@ -169,13 +169,13 @@ BEAM = BeamModel(
 LARGE = 400
 
 
-def _gather(rng: np.random.Generator, height: int, width: int) -> list[NDArray[Any]]:
+def _resample(rng: np.random.Generator, height: int, width: int) -> list[NDArray[Any]]:
     rgb = rng.integers(0, 256, (height, width, 3), np.uint8)
     scale = int(rng.integers(1, 4))
     depth = depth_of(rng, height * scale, width * scale) if rng.random() < 0.3 else depth_of(rng, height, width)
     R = rotation_of(rng) if rng.random() < 0.5 else R_BODY_OPTICAL.T @ rotation_z(rng.uniform(-0.5, 0.5))
     observed = rng.random(depth.shape) < 0.8 if rng.random() < 0.3 else None
-    return list(gather(rgb, depth, camera_of(rng, height, width), R, ViewGrid(), observed))
+    return list(resample(rgb, depth, camera_of(rng, height, width), R, ViewGrid(), observed))
 
 
 def _level(rng: np.random.Generator, height: int, width: int) -> list[NDArray[Any]]:
@@ -299,7 +299,7 @@ def rounds(seed: int, count: int) -> None:
         cloud = street(rng)
         height, width = SIZES[number % len(SIZES)]
         cases: dict[str, Callable[[], list[NDArray[Any]]]] = {
-            "gather": partial(_gather, rng, height, width),
+            "resample": partial(_resample, rng, height, width),
             "level": partial(_level, rng, height, width),
             "points": partial(_points, rng, height, width),
             "align": partial(_align, rng, cloud),

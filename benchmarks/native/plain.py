@@ -6,7 +6,7 @@ from numpy.typing import NDArray
 from service.geometry.camera import PinholeCamera
 from service.geometry.rigid import Rotation, Transform
 from service.imaging import level
-from service.imaging.gather import FEWEST_SAMPLES, _sub_rays
+from service.imaging.resample import FEWEST_SAMPLES, _sub_rays
 from service.imaging.view_grid import ViewGrid
 from service.registration.kernel import BLOCK, KEY_BITS, REGION, NearestGrid, QueryPoints, SolverOptions
 from service.registration.points import LEAST_NOISE, NOISE_ROWS, NOISE_STEPS, PointSettings
@@ -57,7 +57,7 @@ def fit_ground(
     return [*solution.tolist(), int(measured.sum()), int((np.abs(off) <= band).sum()), int((off < -3 * band).sum())]
 
 
-def gathered(
+def resampled(
     rgb: NDArray[np.uint8],
     depth_m: NDArray[np.float32],
     camera: PinholeCamera,
@@ -65,7 +65,7 @@ def gathered(
     grid: ViewGrid,
     observed: NDArray[np.bool_] | None = None,
 ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.bool_]]:
-    """Resample both images to a view grid as ``gather.gather`` does.
+    """Resample both images to a view grid as ``resample.resample`` does.
 
     Args:
         rgb: image (H, W, 3).

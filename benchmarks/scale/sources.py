@@ -116,5 +116,5 @@ def _queries(dataset: Dataset, bundle: MapBundle) -> list[tuple[NDArray[np.float
             place = int(np.hypot(*(bundle.places_xy - truth[:2, 3:4])).argmin())
             its = np.flatnonzero(bundle.view_place == place)
             along = np.cos(bundle.view_heading_rad[its] - heading_of_camera(truth))
-            found.append((localizer.look_up(frame.query(bundle.grid)).descriptors, int(its[along.argmax()])))
+            found.append((localizer.encode_and_search(frame.query(bundle.grid)).descriptors, int(its[along.argmax()])))
     return found

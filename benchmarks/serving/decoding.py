@@ -14,9 +14,9 @@ from model_training.datasets.dataset import Dataset
 from service.geometry.camera import PinholeCamera
 from service.imaging.decode import decode_depth, decode_rgb
 from service.imaging.depth_formats import read_depth_values
-from service.imaging.gather import finest_rad
 from service.imaging.picture_headers import DEFAULT_LIMITS
 from service.imaging.raw16 import write_raw16
+from service.imaging.resample import finest_rad
 from service.imaging.view_grid import ViewGrid
 from service.runtime.threads import limit_pools
 

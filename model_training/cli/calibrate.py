@@ -16,6 +16,7 @@ from model_training.calibration.rendered_rig import RigFile, frames_of_rig, read
 from model_training.cli.progress import bars
 from model_training.datasets.dataset import Dataset, require_map_first
 from model_training.mapping.build import describe
+from model_training.mapping.calibration_file import renew_calibration
 from model_training.stock import CALIBRATION, ENCODER
 from service.errors import BundleError, DatasetError
 from service.localization.localizer import Localizer
@@ -28,6 +29,8 @@ from service.maps.writer import replace_calibration
 WORK = Path("data/calibration")
 #: Standard deviation of the end point of an odometry as a share of the distance, and queries at a time, if none is given.
 ODOMETRY_NOISE, WORKERS = 0.02, 2
+#: Value of --calibration for the calibration of the stock encoder.
+STOCK = Path("stock")
 
 
 def command(
@@ -79,10 +82,17 @@ def command(
     workers: Annotated[
         int | None, typer.Option(help="With --map: queries that run at a time.  [default: 2]", min=1)
     ] = None,
+    calibration: Annotated[
+        Path | None,
+        typer.Option(
+            help="With --map: calibration file that replaces that of the map, for example after an update of Streetfix. `stock` is that of "
+            "the stock encoder. The map keeps its site check."
+        ),
+    ] = None,
 ) -> None:
-    """Fit the confidence of an encoder on calibration cities, or correct the confidence of a map for a rig.
+    """Fit the confidence of an encoder on calibration cities, or correct or renew the confidence of a map.
 
-    The first simulates the cities, which takes about two hours. The second takes seconds to minutes.
+    The first simulates the cities, which takes about two hours. A correction takes seconds to minutes, and a renewal no time.
 
     \b
     Examples:
@@ -90,17 +100,25 @@ def command(
       streetfix build-map data/site --encoder runs/mine/encoder.onnx --calibration runs/mine/calibration.json --out maps/site
       streetfix calibrate --map maps/site --drive data/robot --queries recorded
       streetfix calibrate --map maps/site --rig rig.json --out rig_calibration.json
+      streetfix calibrate --map maps/site --calibration stock
     """
     of_drive = {"--queries": queries, "--odometry-noise": odometry_noise}
     if out is not None and not out.parent.is_dir():  # said before the work, not after it
         raise DatasetError(f"--out: folder {out.parent} not found; create it first", field="out")
     if map_bundle is None:
-        if given := _given({"--drive": drive, "--rig": rig, "--workers": workers, **of_drive}):
-            raise typer.BadParameter(f"{given} corrects the confidence of a map; give the map with --map")
+        if given := _given(
+            {"--drive": drive, "--rig": rig, "--workers": workers, "--calibration": calibration, **of_drive}
+        ):
+            raise typer.BadParameter(f"{given} changes the confidence of a map; give the map with --map")
         _calibrate_encoder(encoder or ENCODER, out or CALIBRATION, work or WORK, anew=anew)
         return
     if given := _given({"--encoder": encoder, "--work": work, "--anew": anew or None}):
         raise typer.BadParameter(f"--map uses the encoder and the calibration of the map; leave out {given}")
+    if calibration is not None:
+        if given := _given({"--drive": drive, "--rig": rig, "--out": out, "--workers": workers, **of_drive}):
+            raise typer.BadParameter(f"--calibration replaces the calibration of the map; leave out {given}")
+        _renew(map_bundle, CALIBRATION if calibration == STOCK else calibration)
+        return
     if drive is None and (given := _given(of_drive)):
         raise typer.BadParameter(f"{given} belongs to --drive; give the recording with --drive")
     if out is not None and out.resolve().is_relative_to(map_bundle.resolve()):
@@ -125,7 +143,7 @@ def _source(map_bundle: Path, drive: Path | None, rig: Path | None) -> Dataset |
         return Dataset(drive)
     if rig is not None and drive is None:
         return read_rig(rig)
-    raise typer.BadParameter("--map needs either --drive or --rig")
+    raise typer.BadParameter("--map needs either --drive, --rig or --calibration")
 
 
 def _calibrate_encoder(encoder: Path, out: Path, work: Path, *, anew: bool) -> None:
@@ -136,6 +154,14 @@ def _calibrate_encoder(encoder: Path, out: Path, work: Path, *, anew: bool) -> N
         console.print(line, soft_wrap=True)
     _write(out, calibration)
     console.print(f"written: {out}")
+
+
+def _renew(folder: Path, calibration: Path) -> None:
+    console = Console(highlight=False, soft_wrap=True)
+    manifest, had_rig = renew_calibration(folder, calibration)
+    if had_rig:
+        console.print("removed: the correction for a rig; learn it again with --drive or --rig")
+    console.print(f"{describe(manifest)}: {folder}")
 
 
 def _calibrate_rig(

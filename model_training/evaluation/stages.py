@@ -24,7 +24,7 @@ from service.registration.points import blocks_of, points_from
 from service.registration.register import RegistrationSettings, Start, register, registered_of, score
 from service.registration.surfel_tiles import Cloud
 from service.retrieval.knn import distinct_places
-from service.retrieval.retrieve import RANKED, Frame
+from service.retrieval.retrieve import RANKED, EncodedFrame
 from service.retrieval.starts import starts_from
 
 #: Largest error of a right level. Registration starts from it and corrects about this much.
@@ -142,7 +142,7 @@ def stages_of(
 
 def _stages(localizer: Localizer, cloud: Cloud, asked: QueryFrame, truth: Transform) -> QueryStages:
     try:
-        frame = localizer.look_up(asked.query(localizer.bundle.grid))
+        frame = localizer.encode_and_search(asked.query(localizer.bundle.grid))
     except NoDepthError:
         return QueryStages(number=asked.number)
     answer, bundle = localizer.answer((frame,)), localizer.bundle
@@ -200,7 +200,7 @@ def loses(found: QueryStages) -> Lost:
     return Lost.REGISTRATION if found.from_truth_m > RIGHT_M else Lost.CANDIDATES
 
 
-def _level_errors(localizer: Localizer, frame: Frame, truth: Transform) -> tuple[float, float]:
+def _level_errors(localizer: Localizer, frame: EncodedFrame, truth: Transform) -> tuple[float, float]:
     """Return the angle between the estimated vertical and the map's (degrees), and the error of the camera height (metres)."""
     bundle = localizer.bundle
     nearest = int(np.argmin(np.linalg.norm(bundle.T_map_place[:, :2, 3] - truth[:2, 3], axis=1)))
@@ -211,7 +211,7 @@ def _level_errors(localizer: Localizer, frame: Frame, truth: Transform) -> tuple
     return float(np.rad2deg(tilt)), float(frame.views.height_m - true_height_m)
 
 
-def _candidates(answer: Answer, frame: Frame) -> Iterator[tuple[Rotation, np.ndarray]]:
+def _candidates(answer: Answer, frame: EncodedFrame) -> Iterator[tuple[Rotation, np.ndarray]]:
     for candidate in answer.candidates or ():
         T = candidate.T_map_camera
         yield T[:3, :3] @ frame.R_level_camera.T, T[:3, 3]
@@ -227,7 +227,9 @@ def _nearest(poses: Iterator[tuple[Rotation, np.ndarray]], truth: Transform, hea
     return min(away, default=np.inf)
 
 
-def _from_truth(localizer: Localizer, cloud: Cloud, frame: Frame, truth: Transform) -> tuple[float, float, float]:
+def _from_truth(
+    localizer: Localizer, cloud: Cloud, frame: EncodedFrame, truth: Transform
+) -> tuple[float, float, float]:
     """Register from the true pose; return the distance that it moves (metres) and the share of inliers before and after."""
     settings = localizer.refining
     rig_px_m = frame.query.focal_baseline_px_m

@@ -124,7 +124,7 @@ def followed(localizer: Localizer, drives: list[list[Step]], report: Report = la
         track = Track()
         for column, step in enumerate(drive):
             try:
-                frame = localizer.look_up(step.frame.query(localizer.bundle.grid))
+                frame = localizer.encode_and_search(step.frame.query(localizer.bundle.grid))
             except NoDepthError:
                 track = track.broken()
                 epoch[row, column] = track.epoch

@@ -20,8 +20,8 @@ from model_training.simulation.shading import Light
 from model_training.simulation.stereo_pair import StereoModel, StereoRig
 from service.geometry.camera import PinholeCamera
 from service.geometry.rigid import R_BODY_OPTICAL, Transform, heading_of_camera
-from service.imaging.gather import gather
 from service.imaging.level import level_camera
+from service.imaging.resample import resample
 from service.imaging.view_grid import ViewGrid
 
 #: Camera height if the image shows no ground, metres; the same value as in the service.
@@ -115,6 +115,6 @@ class RigOfADrive:
         )
         depth_m = self._stereo.depth(left, right)
         level = level_camera(depth_m, self._rig.camera, down_camera=None, nominal_height_m=NOMINAL_HEIGHT_M)
-        ranges, colour, seen = gather(left, depth_m, self._rig.camera, level.R_level_camera.T, grid)
+        ranges, colour, seen = resample(left, depth_m, self._rig.camera, level.R_level_camera.T, grid)
         rgb = np.rint(colour).clip(0, 255).astype(np.uint8)
         return MatchedView(ranges, rgb, seen, heading_of_camera(T_map_camera), level.height_m)

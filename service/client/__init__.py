@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 from service.client.async_client import AsyncClient
 from service.client.client import Client
-from service.client.prepare import About, AboutSequence, Frame, Track
+from service.client.prepare import Frame, RequestOptions, SequenceOptions, Track
 from service.client.retry import RetryPolicy
 from service.contract.schema import (
     LocalizeAnswer,
@@ -37,8 +37,6 @@ if TYPE_CHECKING:
     from service.client.grpc_client import GrpcClient
 
 __all__ = [
-    "About",
-    "AboutSequence",
     "AsyncClient",
     "Client",
     "ForeignServiceError",
@@ -58,7 +56,9 @@ __all__ = [
     "PriorWgs84",
     "RefusedError",
     "RequestError",
+    "RequestOptions",
     "RetryPolicy",
+    "SequenceOptions",
     "StreetfixError",
     "Track",
     "UnavailableError",

@@ -12,7 +12,7 @@ import httpx
 
 from service.client import prepare, rest
 from service.client.encode import JPEG_QUALITY, Packing
-from service.client.prepare import About, AboutSequence, Camera, Depth, Frame, Rgb
+from service.client.prepare import Camera, Depth, Frame, RequestOptions, Rgb, SequenceOptions
 from service.client.retry import Attempts, RetryPolicy
 from service.client.tls import ClientTls
 from service.contract.schema import LocalizeAnswer, MapEntry
@@ -67,7 +67,7 @@ class AsyncClient:
         """Close all connections."""
         await self._http.aclose()
 
-    async def localize(self, rgb: Rgb, depth: Depth, camera: Camera, **about: Unpack[About]) -> LocalizeAnswer:
+    async def localize(self, rgb: Rgb, depth: Depth, camera: Camera, **about: Unpack[RequestOptions]) -> LocalizeAnswer:
         """Localize one query, as ``Client.localize`` does.
 
         Args:
@@ -77,29 +77,29 @@ class AsyncClient:
                 or raw16 file.
             camera: intrinsics of both images, pixels, and their distortion if they are not rectified. Either image may be a
                 uniformly resized version of this camera's image.
-            **about: optional data; see ``About``.
+            **about: optional data; see ``RequestOptions``.
         """
         prepared = await asyncio.to_thread(prepare.one, rgb, depth, camera, about, self._packing)
         return await self.call(rest.localize(prepared))
 
-    async def localize_sequence(self, frames: Sequence[Frame], **about: Unpack[AboutSequence]) -> LocalizeAnswer:
+    async def localize_sequence(self, frames: Sequence[Frame], **about: Unpack[SequenceOptions]) -> LocalizeAnswer:
         """Localize the first frame of a sequence, as ``Client.localize_sequence`` does.
 
         Args:
             frames: the first frame is the reference. Each further frame needs ``T_reference_camera``, as from odometry.
-            **about: optional data; see ``AboutSequence``.
+            **about: optional data; see ``SequenceOptions``.
         """
         prepared = await asyncio.to_thread(prepare.sequence, frames, about, self._packing)
         return await self.call(rest.localize_sequence(prepared))
 
     async def localize_batch(
-        self, frames: Sequence[Frame], **about: Unpack[AboutSequence]
+        self, frames: Sequence[Frame], **about: Unpack[SequenceOptions]
     ) -> list[LocalizeAnswer | RefusedError]:
         """Localize a batch of independent queries, as ``Client.localize_batch`` does.
 
         Args:
             frames: the queries. ``T_reference_camera`` must be None.
-            **about: optional data for every query; see ``AboutSequence``.
+            **about: optional data for every query; see ``SequenceOptions``.
         """
         prepared = await asyncio.to_thread(prepare.several, frames, about, self._packing)
         return await self.call(rest.localize_batch(prepared))

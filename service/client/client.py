@@ -11,7 +11,7 @@ import httpx
 
 from service.client import prepare, rest
 from service.client.encode import JPEG_QUALITY, Packing
-from service.client.prepare import About, AboutSequence, Camera, Depth, Frame, Rgb
+from service.client.prepare import Camera, Depth, Frame, RequestOptions, Rgb, SequenceOptions
 from service.client.retry import Attempts, RetryPolicy
 from service.client.tls import ClientTls
 from service.contract.schema import LocalizeAnswer, MapEntry
@@ -86,7 +86,7 @@ class Client:
         """Close all connections."""
         self._http.close()
 
-    def localize(self, rgb: Rgb, depth: Depth, camera: Camera, **about: Unpack[About]) -> LocalizeAnswer:
+    def localize(self, rgb: Rgb, depth: Depth, camera: Camera, **about: Unpack[RequestOptions]) -> LocalizeAnswer:
         """Localize one query.
 
         Args:
@@ -96,7 +96,7 @@ class Client:
                 or raw16 file.
             camera: intrinsics of both images, pixels, and their distortion if they are not rectified. Either image may be a
                 uniformly resized version of this camera's image.
-            **about: optional data; see ``About``.
+            **about: optional data; see ``RequestOptions``.
 
         Raises:
             RequestError: an argument is invalid.
@@ -108,12 +108,12 @@ class Client:
         """
         return self.call(rest.localize(prepare.one(rgb, depth, camera, about, self._packing)))
 
-    def localize_sequence(self, frames: Sequence[Frame], **about: Unpack[AboutSequence]) -> LocalizeAnswer:
+    def localize_sequence(self, frames: Sequence[Frame], **about: Unpack[SequenceOptions]) -> LocalizeAnswer:
         """Localize the first frame of a sequence whose relative camera poses are known.
 
         Args:
             frames: the first frame is the reference. Each further frame needs ``T_reference_camera``, as from odometry.
-            **about: optional data; see ``AboutSequence``.
+            **about: optional data; see ``SequenceOptions``.
 
         Raises:
             StreetfixError: as ``localize``.
@@ -121,13 +121,13 @@ class Client:
         return self.call(rest.localize_sequence(prepare.sequence(frames, about, self._packing)))
 
     def localize_batch(
-        self, frames: Sequence[Frame], **about: Unpack[AboutSequence]
+        self, frames: Sequence[Frame], **about: Unpack[SequenceOptions]
     ) -> list[LocalizeAnswer | RefusedError]:
         """Localize a batch of independent queries.
 
         Args:
             frames: the queries. ``T_reference_camera`` must be None.
-            **about: optional data for every query; see ``AboutSequence``.
+            **about: optional data for every query; see ``SequenceOptions``.
 
         Returns:
             One entry per query in the same order: the answer, or the error with which the service refused this query.

@@ -12,7 +12,7 @@ import grpc
 from service.client import grpc_messages, prepare
 from service.client.encode import JPEG_QUALITY, Packing
 from service.client.grpc_errors import errors_of_grpc, refused_in_batch
-from service.client.prepare import About, AboutSequence, Camera, Depth, Frame, Rgb
+from service.client.prepare import Camera, Depth, Frame, RequestOptions, Rgb, SequenceOptions
 from service.client.rest import geojson
 from service.client.retry import Attempts, RetryPolicy
 from service.client.tls import ClientTls
@@ -121,7 +121,7 @@ class GrpcClient:
         """Close the channel."""
         self._channel.close()
 
-    def localize(self, rgb: Rgb, depth: Depth, camera: Camera, **about: Unpack[About]) -> LocalizeAnswer:
+    def localize(self, rgb: Rgb, depth: Depth, camera: Camera, **about: Unpack[RequestOptions]) -> LocalizeAnswer:
         """Localize one query, as ``Client.localize`` does.
 
         Args:
@@ -131,29 +131,29 @@ class GrpcClient:
                 or raw16 file.
             camera: intrinsics of both images, pixels, and their distortion if they are not rectified. Either image may be a
                 uniformly resized version of this camera's image.
-            **about: optional data; see ``About``.
+            **about: optional data; see ``RequestOptions``.
         """
         message = grpc_messages.request_message(prepare.one(rgb, depth, camera, about, self._packing))
         return self._call(self._stub.Localize, message, grpc_messages.answer_of)
 
-    def localize_sequence(self, frames: Sequence[Frame], **about: Unpack[AboutSequence]) -> LocalizeAnswer:
+    def localize_sequence(self, frames: Sequence[Frame], **about: Unpack[SequenceOptions]) -> LocalizeAnswer:
         """Localize the first frame of a sequence, as ``Client.localize_sequence`` does.
 
         Args:
             frames: the first frame is the reference. Each further frame needs ``T_reference_camera``, as from odometry.
-            **about: optional data; see ``AboutSequence``.
+            **about: optional data; see ``SequenceOptions``.
         """
         message = grpc_messages.sequence_message(prepare.sequence(frames, about, self._packing))
         return self._call(self._stub.LocalizeSequence, message, lambda got: grpc_messages.answer_of(got.answer))
 
     def localize_batch(
-        self, frames: Sequence[Frame], **about: Unpack[AboutSequence]
+        self, frames: Sequence[Frame], **about: Unpack[SequenceOptions]
     ) -> list[LocalizeAnswer | RefusedError]:
         """Localize a batch of independent queries, as ``Client.localize_batch`` does.
 
         Args:
             frames: the queries. ``T_reference_camera`` must be None.
-            **about: optional data for every query; see ``AboutSequence``.
+            **about: optional data for every query; see ``SequenceOptions``.
         """
         message = grpc_messages.batch_message(prepare.several(frames, about, self._packing))
         return self._call(self._stub.LocalizeBatch, message, _outcomes)

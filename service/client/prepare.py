@@ -36,7 +36,7 @@ class Track:
     T_previous_camera: NDArray[Any] | None = None
 
 
-class About(TypedDict, total=False):
+class RequestOptions(TypedDict, total=False):
     """Optional data of a query.
 
     Attributes:
@@ -73,8 +73,8 @@ class About(TypedDict, total=False):
     track: Track | None
 
 
-class AboutSequence(TypedDict, total=False):
-    """Optional data of a sequence or a batch, as in ``About``.
+class SequenceOptions(TypedDict, total=False):
+    """Optional data of a sequence or a batch, as in ``RequestOptions``.
 
     In a sequence ``T_vehicle_camera`` and ``prior`` describe the camera of the first frame.
 
@@ -83,7 +83,7 @@ class AboutSequence(TypedDict, total=False):
         T_vehicle_camera: (4, 4), pose of the camera in the vehicle frame, metres.
         prior: prior knowledge of the camera's pose.
         options: what the answer contains.
-        vehicle_base_on_ground: whether the origin of the vehicle frame lies on the ground, as in ``About``.
+        vehicle_base_on_ground: whether the origin of the vehicle frame lies on the ground, as in ``RequestOptions``.
     """
 
     map: str | None
@@ -104,7 +104,7 @@ class Frame:
         camera: intrinsics of both images, pixels, and their distortion if they are not rectified.
         T_reference_camera: (4, 4), transform from this camera to the first frame's camera, metres. None in the first frame
             and in a batch.
-        gravity, depth_scale_m, depth_kind, max_range_m, baseline_m, camera_height_m, camera_height_std_m: as in ``About``.
+        gravity, depth_scale_m, depth_kind, max_range_m, baseline_m, camera_height_m, camera_height_std_m: as in ``RequestOptions``.
     """
 
     rgb: Rgb
@@ -134,7 +134,7 @@ class PreparedRequest(Generic[D]):
 
 
 def one(
-    rgb: Rgb, depth: Depth, camera: Camera, about: About, packing: Packing
+    rgb: Rgb, depth: Depth, camera: Camera, about: RequestOptions, packing: Packing
 ) -> PreparedRequest[schema.LocalizeRequest]:
     """Build the request for a single query.
 
@@ -149,7 +149,7 @@ def one(
         RequestError: an argument is invalid. ``field`` names it.
         TypeError: ``about`` has an unknown key.
     """
-    _only_known(about, About)
+    _only_known(about, RequestOptions)
     names = (
         "gravity",
         "depth_scale_m",
@@ -159,14 +159,14 @@ def one(
         "camera_height_m",
         "camera_height_std_m",
     )
-    known = {name: about[name] for name in names if name in about}  # type: ignore[literal-required]  # names of About
+    known = {name: about[name] for name in names if name in about}  # type: ignore[literal-required]  # names of RequestOptions
     frame = Frame(rgb=rgb, depth=depth, camera=camera, **known)
     said, pictures = _frame(frame, packing)
     content = said | _of_all(about) | _track(about.get("track"))
     return PreparedRequest(_checked(lambda: schema.LocalizeRequest.model_validate(content)), (pictures,))
 
 
-def several(frames: Sequence[Frame], about: AboutSequence, packing: Packing) -> PreparedRequest[schema.BatchRequest]:
+def several(frames: Sequence[Frame], about: SequenceOptions, packing: Packing) -> PreparedRequest[schema.BatchRequest]:
     """Build the request for a batch of independent queries.
 
     Args:
@@ -178,7 +178,7 @@ def several(frames: Sequence[Frame], about: AboutSequence, packing: Packing) -> 
         RequestError: as ``one``, or a frame has a ``T_reference_camera``.
         TypeError: ``about`` has an unknown key.
     """
-    _only_known(about, AboutSequence)
+    _only_known(about, SequenceOptions)
     for number, frame in enumerate(frames):
         if frame.T_reference_camera is not None:
             raise RequestError(
@@ -192,7 +192,7 @@ def several(frames: Sequence[Frame], about: AboutSequence, packing: Packing) -> 
 
 
 def sequence(
-    frames: Sequence[Frame], about: AboutSequence, packing: Packing
+    frames: Sequence[Frame], about: SequenceOptions, packing: Packing
 ) -> PreparedRequest[schema.SequenceRequest]:
     """Build the request for a sequence, which gets one common answer.
 
@@ -205,7 +205,7 @@ def sequence(
         RequestError: as ``one``.
         TypeError: ``about`` has an unknown key.
     """
-    _only_known(about, AboutSequence)
+    _only_known(about, SequenceOptions)
     said = [_frame(frame, packing, f"frames.{number}.") for number, frame in enumerate(frames)]
     content = [
         each | {"T_reference_camera": _transform(frame.T_reference_camera, f"frames.{number}.T_reference_camera")}
@@ -259,7 +259,7 @@ def _file(data: bytes, field: str) -> bytes:
     return data
 
 
-def _of_all(about: About | AboutSequence) -> dict[str, Any]:
+def _of_all(about: RequestOptions | SequenceOptions) -> dict[str, Any]:
     """Return the request fields that a single query and a sequence have in common.
 
     Raises:
@@ -360,7 +360,7 @@ def _transform(T: NDArray[Any] | None, field: str) -> dict[str, Any] | None:
     return {"position": position, "orientation": {"x": x, "y": y, "z": z, "w": w}}
 
 
-def _only_known(about: About | AboutSequence, known: type) -> None:
+def _only_known(about: RequestOptions | SequenceOptions, known: type) -> None:
     if unknown := sorted(set(about) - set(known.__annotations__)):
         raise TypeError(f"unknown argument {unknown[0]!r}; pass one of {', '.join(known.__annotations__)}")
 

@@ -18,7 +18,7 @@ from service.imaging.view_grid import ViewGrid
 from service.maps.calibration import Calibration
 from service.retrieval.hypotheses import Hypothesis
 from service.retrieval.knn import Neighbour
-from service.retrieval.retrieve import Frame
+from service.retrieval.retrieve import EncodedFrame
 from service.scoring.candidates import Candidate, Refined, behind, distinct_candidates, log_shares
 
 #: A neighbour further than OTHER_PLACE_M from the answer is another place (feature ``similarity_margin``).
@@ -44,7 +44,7 @@ class Evidence:
         grid: view grid of the map.
     """
 
-    frames: tuple[Frame, ...]
+    frames: tuple[EncodedFrame, ...]
     refined: Refined
     neighbours: tuple[Neighbour, ...]
     hypotheses: tuple[Hypothesis, ...]
@@ -212,7 +212,7 @@ UNWEIGHED = tuple(feature.name for feature in TABLE if not feature.weighted)
 
 
 def evidence_of(
-    frames: tuple[Frame, ...],
+    frames: tuple[EncodedFrame, ...],
     refined: Refined,
     neighbours: tuple[Neighbour, ...],
     hypotheses: tuple[Hypothesis, ...],
@@ -245,6 +245,7 @@ def require_features(calibration: Calibration | None, path: str) -> None:
     """
     if calibration is not None and calibration.names != FEATURES:
         raise BundleError(
-            f"{path}: the confidence features are not those of this release ({', '.join(FEATURES)}); build the map again",
+            f"{path}: the confidence features are not those of this release ({', '.join(FEATURES)}); renew the calibration with "
+            "`streetfix calibrate --map MAP --calibration stock`, or build the map again",
             field="calibration.json",
         )

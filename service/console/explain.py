@@ -11,7 +11,7 @@ from service.console.pictures import depth_picture, enlarged, png_of
 from service.geometry.camera import PinholeCamera
 from service.geometry.rigid import R_BODY_OPTICAL, Transform, rotation_z, transform_from, transform_points
 from service.imaging.fusion import picture_of
-from service.imaging.gather import gather
+from service.imaging.resample import resample
 from service.imaging.view_grid import ViewGrid
 from service.localization.refine import RefineSettings
 from service.maps.map import Map
@@ -19,7 +19,7 @@ from service.registration.kernel import render
 from service.registration.register import Registered
 from service.registration.surfel_map import TILE_M, SurfelMap
 from service.retrieval.query import Query
-from service.retrieval.retrieve import Frame
+from service.retrieval.retrieve import EncodedFrame
 from service.runtime.engine import EncodedQuery, Engine, Located
 from service.runtime.memory import EXPLAIN_PEAK
 from service.scoring.rendered_depth import REACH_M, SURFEL_M
@@ -62,7 +62,7 @@ def explain(engine: Engine, encoded: EncodedQuery) -> Explanation:
         StreetfixError: as ``Engine.localize``.
     """
     localizer = engine.registry.get(encoded.map_name)
-    frame = engine.look_up(localizer, encoded)
+    frame = engine.encode_and_search(localizer, encoded)
     located = engine.answer(localizer, (frame,))
     answer, bundle = located.answer, located.bundle
     T_map_camera = answer.T_map_camera_guess
@@ -90,7 +90,7 @@ def explain(engine: Engine, encoded: EncodedQuery) -> Explanation:
 
 
 def mapped_depth(
-    frame: Frame, registered: Registered | None, settings: RefineSettings
+    frame: EncodedFrame, registered: Registered | None, settings: RefineSettings
 ) -> Float32[NDArray[np.float32], "H W"]:
     """Return the depth image corrected by the scale and the disparity offset that registration estimated, m.
 
@@ -106,7 +106,7 @@ def mapped_depth(
     return (depth_m * registered.scale / (1.0 + registered.offset * depth_m / unit)).astype(np.float32)
 
 
-def _fused(frame: Frame, grid: ViewGrid) -> NDArray[np.uint8]:
+def _fused(frame: EncodedFrame, grid: ViewGrid) -> NDArray[np.uint8]:
     """Return an image of the query view at the turn closest to 0."""
     ahead = int(np.argmin(np.abs(frame.views.turns_rad)))
     return enlarged(picture_of(frame.views.planes[ahead, :3], grid.max_range_m), _CELL_PIXELS)
@@ -120,7 +120,7 @@ def _map_view(
     camera = camera_over(bundle.grid)
     depth_m = _drawn_map(cloud, T_map_camera, camera)
     grey = np.full((*depth_m.shape, 3), 128, np.uint8)
-    ranges, _, _ = gather(grey, depth_m, camera, np.ascontiguousarray(R_BODY_OPTICAL.T), bundle.grid)
+    ranges, _, _ = resample(grey, depth_m, camera, np.ascontiguousarray(R_BODY_OPTICAL.T), bundle.grid)
     ranges = np.where(ranges <= bundle.grid.max_range_m, ranges, 0) * bundle.rows_seen[:, None]
     colourless = np.zeros((2, *ranges.shape), np.float32)
     planes = np.concatenate([ranges[None], colourless]).astype(np.float32)

@@ -36,7 +36,7 @@ LIBRARIES: Mapping[str, Callable[[], Any]] = {
     "registration/_points.so": partial(_library_of, "service.registration.points", "_library"),
     "registration/_rays.so": partial(_library_of, "service.registration.visibility", "_library"),
     "imaging/_depth16.so": partial(_library_of, "service.imaging.depth16", "library"),
-    "imaging/_gather.so": partial(_library_of, "service.imaging.gather", "_library"),
+    "imaging/_resample.so": partial(_library_of, "service.imaging.resample", "_library"),
     "imaging/_level.so": partial(_library_of, "service.imaging.level", "_library"),
 }
 

@@ -7,8 +7,8 @@ from numpy.typing import NDArray
 from service.doctor.finding import Finding
 from service.doctor.pair import Pair
 from service.errors import StreetfixError
-from service.imaging.gather import gather
 from service.imaging.level import level_query
+from service.imaging.resample import resample
 from service.localization.answer import Answer
 from service.localization.localizer import Localizer
 from service.maps.map import Map
@@ -27,7 +27,7 @@ def rows_of_camera(pair: Pair, bundle: Map) -> Bool[NDArray[np.bool_], " rows"]:
     """
     encoded, flat = pair.encoded, pair.rectified()
     level, _ = level_query(flat.depth_m, flat.camera, down_camera=encoded.down_camera, given=encoded.camera_height)
-    _, _, seen = gather(flat.rgb, flat.depth_m, flat.camera, level.R_level_camera.T, bundle.grid, flat.observed)
+    _, _, seen = resample(flat.rgb, flat.depth_m, flat.camera, level.R_level_camera.T, bundle.grid, flat.observed)
     columns = int(seen.any(axis=0).sum())
     rows: Bool[NDArray[np.bool_], " rows"] = (seen.sum(axis=1) * 2 >= columns) & (columns > 0)
     return rows

@@ -11,8 +11,8 @@ from service.geometry.camera import PinholeCamera
 from service.geometry.rigid import Rotation, rotation_z
 from service.imaging.depth_unit_hint import unit_hint
 from service.imaging.fusion import fuse
-from service.imaging.gather import gather
 from service.imaging.level import GivenHeight, HeightOrigin, level_query
+from service.imaging.resample import resample
 from service.imaging.view_grid import PLANES, Planes, ViewGrid, brightness, heights_of
 
 
@@ -132,7 +132,7 @@ def query_views(
     level, height_origin = level_query(depth_m, camera, down_camera=down_camera, given=given_height)
     aside = max(abs(turn) for turn in turns)
     R_camera_view = level.R_level_camera.T @ rotation_z(turn_rad)
-    ranges, colour, seen = gather(rgb, depth_m, camera, R_camera_view, grid.widened(aside), observed)
+    ranges, colour, seen = resample(rgb, depth_m, camera, R_camera_view, grid.widened(aside), observed)
     seen &= rows_seen[:, None]
     ranges *= seen
     colour *= seen[..., None]

@@ -14,7 +14,7 @@ from service.localization.answer import Answer, Timings, require_finite
 from service.maps.map import Map
 from service.retrieval.hypotheses import Hypothesis
 from service.retrieval.knn import Neighbour
-from service.retrieval.retrieve import Frame, Retrieved
+from service.retrieval.retrieve import EncodedFrame, Retrieved
 from service.scoring.candidates import Candidate, Refined
 from service.timing import durations_ms, stage
 
@@ -39,7 +39,7 @@ class Found:
     decision: Decision | None
 
 
-def compose(bundle: Map, frames: tuple[Frame, ...], found: Found, extent: Extent) -> Answer:
+def compose(bundle: Map, frames: tuple[EncodedFrame, ...], found: Found, extent: Extent) -> Answer:
     """Build an answer from the results of all stages.
 
     Args:

@@ -15,7 +15,7 @@ from service.maps.map import Map
 from service.retrieval.encoder import Encoder, Provider
 from service.retrieval.hypotheses import ClusterSettings
 from service.retrieval.query import Query
-from service.retrieval.retrieve import Frame, look_up, require_encoder_of, retrieve
+from service.retrieval.retrieve import EncodedFrame, encode_and_search, require_encoder_of, retrieve
 from service.retrieval.starts import start_positions_m
 from service.timing import stage, timed_request
 
@@ -92,9 +92,9 @@ class Localizer:
             NotFiniteError: a number of the answer is not finite, because of a defect of this program or of the map.
         """
         pairs = zip(queries, T_reference_camera, strict=True)
-        return self.answer(tuple(replace(self.look_up(query), T_reference_camera=T) for query, T in pairs))
+        return self.answer(tuple(replace(self.encode_and_search(query), T_reference_camera=T) for query, T in pairs))
 
-    def look_up(self, query: Query) -> Frame:
+    def encode_and_search(self, query: Query) -> EncodedFrame:
         """Encode one image pair and search the map for similar views, without registration.
 
         The returned frame is a reference. Set its ``T_reference_camera`` to use it as another frame of a query.
@@ -105,11 +105,11 @@ class Localizer:
         Raises:
             NoDepthError: the depth image holds no measurement within the view grid.
         """
-        return look_up(self.bundle, self.encoder, query, self.clusters)
+        return encode_and_search(self.bundle, self.encoder, query, self.clusters)
 
     @timed_request()
-    def answer(self, frames: tuple[Frame, ...]) -> Answer:
-        """Answer a query from frames that ``look_up`` returned.
+    def answer(self, frames: tuple[EncodedFrame, ...]) -> Answer:
+        """Answer a query from frames that ``encode_and_search`` returned.
 
         Args:
             frames: image pairs, the reference first, as in ``localize_frames``.
@@ -120,7 +120,7 @@ class Localizer:
         """
         return self.compose(frames, self.register(frames))
 
-    def register(self, frames: tuple[Frame, ...], predicted: tuple[Transform, ...] = ()) -> Found:
+    def register(self, frames: tuple[EncodedFrame, ...], predicted: tuple[Transform, ...] = ()) -> Found:
         """Retrieve, register and decide, without the parts of an answer that only its reader needs.
 
         Args:
@@ -148,7 +148,7 @@ class Localizer:
             decision = None if cloud is None else decision_of(bundle.calibration, query, refined, evidence)
             return Found(retrieved, refined, evidence, decision)
 
-    def compose(self, frames: tuple[Frame, ...], found: Found) -> Answer:
+    def compose(self, frames: tuple[EncodedFrame, ...], found: Found) -> Answer:
         """Build the answer.
 
         Args:

@@ -24,7 +24,7 @@ from service.registration.register import RegistrationSettings, Start, register
 from service.registration.surfel_tiles import Cloud
 from service.registration.visibility import Raycasters
 from service.retrieval.prior import Prior
-from service.retrieval.retrieve import Frame
+from service.retrieval.retrieve import EncodedFrame
 from service.retrieval.starts import StartSettings, starts_from
 from service.scoring.candidates import Candidate, Refined
 from service.scoring.confirmation import confirm
@@ -90,7 +90,7 @@ OFFSET_PX = 0.6
 def refine(
     bundle: Map,
     cloud: Cloud,
-    frames: tuple[Frame, ...],
+    frames: tuple[EncodedFrame, ...],
     prior: Prior | None,
     settings: RefineSettings,
     predicted: tuple[Transform, ...] = (),
@@ -180,7 +180,7 @@ def refine(
 def _starts_at(
     bundle: Map,
     measured: tuple[MeasuredFrame, ...],
-    reference: Frame,
+    reference: EncodedFrame,
     predicted: tuple[Transform, ...],
     *,
     first: int,

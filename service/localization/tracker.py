@@ -14,7 +14,7 @@ from service.localization.belief import Belief, Mode, Seen, agrees, moved, sight
 from service.localization.compose import Found
 from service.localization.localizer import Localizer
 from service.option_limits import FALSE_ACCEPT_RATE
-from service.retrieval.retrieve import Frame
+from service.retrieval.retrieve import EncodedFrame
 from service.scoring.candidates import RIVAL_M, Candidate, distinct_candidates, shares_of
 from service.timing import stage, timed_request
 
@@ -44,7 +44,7 @@ class Track:
     belief: Belief = field(default_factory=Belief)
     epoch: int = 0
     last: Mode | None = None
-    frames: tuple[Frame, ...] = ()
+    frames: tuple[EncodedFrame, ...] = ()
 
     def broken(self) -> "Track":
         """Return the track after a frame whose odometry is unknown: nothing is left but the count of disruptions."""
@@ -53,7 +53,7 @@ class Track:
 
 @timed_request()
 def follow(
-    localizer: Localizer, frame: Frame, track: Track, T_previous_camera: Transform | None
+    localizer: Localizer, frame: EncodedFrame, track: Track, T_previous_camera: Transform | None
 ) -> tuple[Answer, Track]:
     """Answer the next frame of a robot.
 
@@ -65,7 +65,7 @@ def follow(
 
     Args:
         localizer: of the map.
-        frame: as from ``Localizer.look_up``.
+        frame: as from ``Localizer.encode_and_search``.
         track: of the frames before; ``Track()`` begins.
         T_previous_camera: odometry, from this camera's frame to the previous camera's frame, metres. None: unknown; the track begins
             again.
@@ -78,7 +78,7 @@ def follow(
         NotFiniteError: a number of the answer is not finite, because of a defect of this program or of the map.
     """
     if T_previous_camera is None:
-        track, kept, belief, last = track.broken(), tuple[Frame, ...](), Belief(), None
+        track, kept, belief, last = track.broken(), tuple[EncodedFrame, ...](), Belief(), None
     else:
         back = inverse(T_previous_camera)
         kept = tuple(
@@ -110,18 +110,18 @@ def follow(
     return answer, Track(belief, epoch, last, _window(frame, kept))
 
 
-def _window(frame: Frame, kept: tuple[Frame, ...]) -> tuple[Frame, ...]:
+def _window(frame: EncodedFrame, kept: tuple[EncodedFrame, ...]) -> tuple[EncodedFrame, ...]:
     """Return the frames to keep for the next one. A frame near the last kept one shows the same picture, so it is not kept."""
     is_new = not kept or _is_apart(kept[0])
     return ((frame, *kept) if is_new else kept)[: MOST_FRAMES - 1]
 
 
-def _apart(kept: tuple[Frame, ...]) -> tuple[Frame, ...]:
+def _apart(kept: tuple[EncodedFrame, ...]) -> tuple[EncodedFrame, ...]:
     """Return the kept frames that show another picture than the newest frame."""
     return tuple(each for each in kept if _is_apart(each))
 
 
-def _is_apart(kept: Frame) -> bool:
+def _is_apart(kept: EncodedFrame) -> bool:
     way_m, angle = size_of(kept.T_reference_camera)
     return way_m / APART_M + angle / APART_RAD >= 1.0
 
@@ -134,7 +134,7 @@ def _is_overtaken(last: Mode | None, belief: Belief) -> bool:
     return not agrees(last, first.T_map_camera) and first.weight > max(belief.elsewhere, belief.outside)
 
 
-def _believed(localizer: Localizer, frame: Frame, alone: Found, belief: Belief) -> Belief:
+def _believed(localizer: Localizer, frame: EncodedFrame, alone: Found, belief: Belief) -> Belief:
     """Return the belief after a frame. A frame outside the range of the calibration says nothing at the default false-accept rate."""
     calibration, decision = localizer.bundle.calibration, alone.decision
     if alone.refined is None or calibration is None or decision is None:
@@ -155,7 +155,7 @@ def _seen(candidate: Candidate, covariance: Float64[NDArray[np.float64], "6 6"],
     return Seen(candidate.T_map_camera, covariance, probability, inliers, similarity)
 
 
-def _answer(localizer: Localizer, frames: tuple[Frame, ...], alone: Found, belief: Belief) -> Answer:
+def _answer(localizer: Localizer, frames: tuple[EncodedFrame, ...], alone: Found, belief: Belief) -> Answer:
     """Build the answer from the frame alone, else from all frames together, else from the belief: the first that is accepted."""
     ceiling = partial(_ceiling, alone=alone, belief=belief)
     if _is_localized(alone) and ceiling(alone) > CONTRADICTED:

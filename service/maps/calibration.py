@@ -314,4 +314,7 @@ def read_calibration(document: bytes, *, path: str) -> Calibration | None:
 
 
 def _defect(path: str, what: str) -> BundleError:
-    return BundleError(f"{path}: {what}; build the map again with this release", field="calibration.json")
+    return BundleError(
+        f"{path}: {what}; renew the calibration with `streetfix calibrate --map MAP --calibration stock`, or build the map again with this "
+        "release", field="calibration.json",
+    )  # fmt: skip

@@ -18,10 +18,10 @@ from service.imaging.decode import (
     require_sizes,
     stored_size,
 )
-from service.imaging.gather import finest_rad
 from service.imaging.level import GivenHeight
 from service.imaging.picture_headers import DEFAULT_LIMITS
 from service.imaging.rectify import rectification_of, rectified_pair
+from service.imaging.resample import finest_rad
 from service.imaging.view_grid import ViewGrid
 from service.option_limits import FALSE_ACCEPT_RATE, NEIGHBOURS
 from service.retrieval.prior import Prior

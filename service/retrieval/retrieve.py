@@ -30,7 +30,7 @@ RANKED = 40
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Frame:
+class EncodedFrame:
     """An image pair with the results of the map search.
 
     Attributes:
@@ -56,7 +56,7 @@ class Frame:
         """Rotation from the camera's optical frame to the level frame."""
         return self.views.R_level_camera
 
-    def T_reference_level(self, reference: "Frame") -> Transform:
+    def T_reference_level(self, reference: "EncodedFrame") -> Transform:
         """Compute the pose of this frame's level frame in the level frame of the reference.
 
         The origin of each level frame is at its camera.
@@ -84,7 +84,7 @@ class Retrieved:
     vote: StreetVote | None
 
 
-def look_up(bundle: Map, encoder: Encoder, query: Query, clusters: ClusterSettings) -> Frame:
+def encode_and_search(bundle: Map, encoder: Encoder, query: Query, clusters: ClusterSettings) -> EncodedFrame:
     """Encode one image pair and search the map for similar views.
 
     Args:
@@ -121,15 +121,17 @@ def look_up(bundle: Map, encoder: Encoder, query: Query, clusters: ClusterSettin
         # A query without registration does not need the noise. But a later query of a stream may register this frame
         # (decision 0111).
         noise = inverse_depth_noise(query.depth_m, focal_baseline_px_m=query.focal_baseline_px_m)
-    return Frame(query, np.eye(4), views, descriptors, matches, noise=noise.total, independent_noise=noise.independent)
+    return EncodedFrame(
+        query, np.eye(4), views, descriptors, matches, noise=noise.total, independent_noise=noise.independent
+    )
 
 
-def retrieve(bundle: Map, frame: Frame, clusters: ClusterSettings) -> Retrieved:
+def retrieve(bundle: Map, frame: EncodedFrame, clusters: ClusterSettings) -> Retrieved:
     """Rank the places, cluster the views and vote over the streets, as the paper does.
 
     Args:
         bundle: the map.
-        frame: the reference, as ``look_up`` returned it.
+        frame: the reference, as ``encode_and_search`` returned it.
         clusters: settings of the clustering.
     """
     query = frame.query

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from service.geometry.rigid import Transform, inverse
 from service.registration.register import Start
 from service.retrieval.prior import Prior
-from service.retrieval.retrieve import Frame
+from service.retrieval.retrieve import EncodedFrame
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -39,7 +39,7 @@ Likeness = Callable[[NDArray[np.float64]], NDArray[np.float64]]
 
 
 def starts_from(
-    frames: tuple[Frame, ...],
+    frames: tuple[EncodedFrame, ...],
     prior: Prior | None,
     *,
     lidar_height_m: float,
@@ -86,7 +86,7 @@ def _chosen(
 
 
 def start_positions_m(
-    frames: tuple[Frame, ...], predicted: tuple[Transform, ...], lidar_height_m: float
+    frames: tuple[EncodedFrame, ...], predicted: tuple[Transform, ...], lidar_height_m: float
 ) -> Float64[NDArray[np.float64], "n 3"]:
     """Return the positions of the reference that a registration may start from, map frame, m, the most important first.
 
@@ -101,7 +101,7 @@ def start_positions_m(
     return np.concatenate([np.array([T[:3, 3] for T in predicted]).reshape(-1, 3), similar])
 
 
-def poses_of_matches(frames: tuple[Frame, ...], lidar_height_m: float) -> Float64[NDArray[np.float64], "n 4 4"]:
+def poses_of_matches(frames: tuple[EncodedFrame, ...], lidar_height_m: float) -> Float64[NDArray[np.float64], "n 4 4"]:
     """Return T_map_level of the reference for every match of every frame.
 
     Args:
@@ -111,7 +111,9 @@ def poses_of_matches(frames: tuple[Frame, ...], lidar_height_m: float) -> Float6
     return np.concatenate([_poses(frame, frames[0], lidar_height_m) for frame in frames])
 
 
-def _poses(frame: Frame, reference: Frame, lidar_height_m: float) -> Float64[NDArray[np.float64], "n 4 4"]:
+def _poses(
+    frame: EncodedFrame, reference: EncodedFrame, lidar_height_m: float
+) -> Float64[NDArray[np.float64], "n 4 4"]:
     """Compute T_map_level of the reference for every match of a frame."""
     matches = frame.matches
     up = matches.T_map_place[:, :3, 2]

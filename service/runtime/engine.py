@@ -22,7 +22,7 @@ from service.maps.store.stored_map import StoredMap
 from service.option_limits import NEIGHBOURS
 from service.retrieval.prior import Prior
 from service.retrieval.query import DepthFormat, Query, decoded_query
-from service.retrieval.retrieve import Frame
+from service.retrieval.retrieve import EncodedFrame
 from service.runtime.admission import Admission
 from service.runtime.last_answers import LastAnswers
 from service.runtime.map_registry import MapRegistry
@@ -208,7 +208,7 @@ class Engine:
         frames = []
         for number, (each, T) in enumerate(zip(encoded, T_reference_camera, strict=True)):
             try:
-                frame = self.look_up(localizer, each)
+                frame = self.encode_and_search(localizer, each)
             except StreetfixError as error:
                 if len(encoded) > 1:
                     error.field = f"frames.{number}.{error.field}" if error.field else f"frames.{number}"
@@ -216,7 +216,7 @@ class Engine:
             frames.append(replace(frame, T_reference_camera=T))
         return self.answer(localizer, tuple(frames))
 
-    def answer(self, localizer: Localizer, frames: tuple[Frame, ...]) -> Located:
+    def answer(self, localizer: Localizer, frames: tuple[EncodedFrame, ...]) -> Located:
         """Answer frames that were looked up, and count the answer in the metrics.
 
         Args:
@@ -244,7 +244,7 @@ class Engine:
         Raises:
             StreetfixError: as for ``localize``.
         """
-        answer, following = follow(localizer, self.look_up(localizer, encoded), track, T_previous_camera)
+        answer, following = follow(localizer, self.encode_and_search(localizer, encoded), track, T_previous_camera)
         if following.epoch != track.epoch:
             self.metrics.disrupted(localizer.bundle)
         return self._counted(answer, localizer), following
@@ -279,7 +279,7 @@ class Engine:
         content = packed(following, map_version=version)
         return replace(located, sealed_belief=self._seal.sealed(content))
 
-    def look_up(self, localizer: Localizer, encoded: EncodedQuery) -> Frame:
+    def encode_and_search(self, localizer: Localizer, encoded: EncodedQuery) -> EncodedFrame:
         """Decode an image pair and retrieve its most similar places.
 
         Args:
@@ -291,7 +291,7 @@ class Engine:
         """
         with stage("decode"):
             query = self._decode(encoded, localizer.bundle)
-        return localizer.look_up(query)
+        return localizer.encode_and_search(query)
 
     def close(self) -> None:
         """Wait for running requests and drop waiting ones."""

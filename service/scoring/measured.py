@@ -11,7 +11,7 @@ from service.registration.kernel import QueryPoints
 from service.registration.points import DepthBlocks, PointSettings, blocks_of, movable_of, points_from
 from service.registration.rays import RayPicture, picture_of
 from service.registration.register import Registered
-from service.retrieval.retrieve import Frame
+from service.retrieval.retrieve import EncodedFrame
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -27,7 +27,7 @@ class MeasuredFrame:
         picture: inverse depth image, with its pose in the level frame of the reference.
     """
 
-    frame: Frame
+    frame: EncodedFrame
     is_reference: bool
     T_reference_level: Transform
     blocks: DepthBlocks
@@ -52,7 +52,7 @@ class MeasuredFrame:
 
 
 def measure(
-    frames: tuple[Frame, ...], settings: PointSettings, *, focal_baseline_px_m: float, is_rig: bool
+    frames: tuple[EncodedFrame, ...], settings: PointSettings, *, focal_baseline_px_m: float, is_rig: bool
 ) -> tuple[MeasuredFrame, ...]:
     """Prepare the depth of all frames.
 

@@ -23,7 +23,7 @@ from service.maps.writer import write_bundle
 from service.registration.surfel_map import SurfelMap
 from service.retrieval.knn import ViewMatches
 from service.retrieval.query import Query
-from service.retrieval.retrieve import Frame
+from service.retrieval.retrieve import EncodedFrame
 from tests.unit.street_scene import (  # noqa: F401  # fixtures for the tests of several packages
     candidate,
     points_at,
@@ -68,7 +68,7 @@ def frame_of(
     T_reference_camera: Any = None,
     descriptors: Any = ((1.0, 0.0),),
     noise: float = 1e-4,
-) -> Frame:
+) -> EncodedFrame:
     """Return an image pair with these retrieval matches. The images are black and empty unless given."""
     camera = camera or PinholeCamera(6, 4, 3.0, 3.0, 2.5, 1.5)
     depth_m = np.zeros((camera.height, camera.width), np.float32) if depth_m is None else depth_m
@@ -77,7 +77,7 @@ def frame_of(
     planes = np.zeros((len(turned), 6, ViewGrid().rows, ViewGrid().columns), np.float32)
     views = QueryViews(planes, (0.0,) * len(turned), np.array(R_level_camera), height_m, 0.75)
     T = np.eye(4) if T_reference_camera is None else T_reference_camera
-    return Frame(query, T, views, turned, matches, noise=noise, independent_noise=noise)
+    return EncodedFrame(query, T, views, turned, matches, noise=noise, independent_noise=noise)
 
 
 def calibration_document(**changed: Any) -> dict[str, Any]:
@@ -102,7 +102,7 @@ def matches_at() -> Callable[..., ViewMatches]:
 
 
 @pytest.fixture(scope="session")
-def frame_with() -> Callable[..., Frame]:
+def frame_with() -> Callable[..., EncodedFrame]:
     return frame_of
 
 

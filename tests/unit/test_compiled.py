@@ -11,17 +11,17 @@ import pytest
 import service
 from service.compiled import compiled_layout, declared_layout, load
 from service.errors import StreetfixError
-from service.imaging import depth16, gather, level
+from service.imaging import depth16, level, resample
 from service.imaging.as_c import CPicture
 from service.registration import kernel, points, rays, visibility
 
-LIBRARIES = (gather.LIBRARY, level.LIBRARY, kernel.LIBRARY, points.LIBRARY, visibility.LIBRARY)
+LIBRARIES = (resample.LIBRARY, level.LIBRARY, kernel.LIBRARY, points.LIBRARY, visibility.LIBRARY)
 
 
 @pytest.mark.parametrize(
     "loaded",
     [
-        gather._library,
+        resample._library,
         level._library,
         kernel._library,
         points._library,
@@ -66,20 +66,22 @@ class RenamedPicture(Structure):
     ],
 )
 def test_a_structure_that_lies_otherwise_is_refused(declared, named):
-    with pytest.raises(StreetfixError, match=rf"_gather\.so .*: {named} is .* in C and .* in Python; install .* again"):
-        load(gather.LIBRARY, {"Picture": declared})
+    with pytest.raises(
+        StreetfixError, match=rf"_resample\.so .*: {named} is .* in C and .* in Python; install .* again"
+    ):
+        load(resample.LIBRARY, {"Picture": declared})
 
 
 def test_a_structure_that_c_does_not_know_is_refused():
     with pytest.raises(StreetfixError, match=r"Scene is not there in C"):
-        load(gather.LIBRARY, {"Scene": CPicture})
+        load(resample.LIBRARY, {"Scene": CPicture})
 
 
 def test_a_constant_of_another_value_is_refused():
     with pytest.raises(
         StreetfixError, match=r"SAMPLES is \(offset 0, size 9\) in C and \(offset 0, size 4\) in Python"
     ):
-        load(gather.LIBRARY, constants={"SAMPLES": 4})
+        load(resample.LIBRARY, constants={"SAMPLES": 4})
 
 
 def test_a_library_without_a_table_is_refused():

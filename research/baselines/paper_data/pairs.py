@@ -16,8 +16,8 @@ from research.baselines.answers import nearest_streets
 from service.errors import DatasetError
 from service.geometry.camera import PinholeCamera
 from service.geometry.rigid import heading_of_body
-from service.imaging.gather import gather
 from service.imaging.level import level_camera
+from service.imaging.resample import resample
 from service.imaging.view_grid import ViewGrid
 from service.maps.streets import Streets
 
@@ -131,7 +131,7 @@ def _shrunk(frame: QueryFrame, grid: ViewGrid) -> dict[str, NDArray[np.generic]]
         raise DatasetError("a query set has no poses.txt, so it cannot be used for training", field="queries")
     rgb, depth_m, camera = frame.rgb(), frame.depth_m(), frame.camera.pinhole()
     level = level_camera(depth_m, camera, down_camera=None, nominal_height_m=1.5)
-    ranges, colour, _ = gather(rgb, depth_m, camera, level.R_level_camera.T, grid)
+    ranges, colour, _ = resample(rgb, depth_m, camera, level.R_level_camera.T, grid)
     T_map_level = np.eye(4)
     T_map_level[:3, :3] = T[:3, :3] @ level.R_level_camera.T
     heading = heading_of_body(T_map_level)

@@ -20,7 +20,7 @@ from service.maps.reader import MapBundle
 from service.registration.register import Registered
 from service.retrieval.prior import Prior
 from service.retrieval.query import Query
-from service.retrieval.retrieve import Frame, Retrieved
+from service.retrieval.retrieve import EncodedFrame, Retrieved
 from service.scoring.candidates import Candidate, Refined
 from service.scoring.confirmation import Confirmation
 
@@ -54,14 +54,14 @@ class Scripted(Localizer):
         self.bundle: Any = SimpleNamespace(cloud=True, calibration=SimpleNamespace(threshold=lambda _: THRESHOLD))
         self.predicted: list[int] = []
 
-    def register(self, frames: tuple[Frame, ...], predicted: tuple[Any, ...] = ()) -> Found:
+    def register(self, frames: tuple[EncodedFrame, ...], predicted: tuple[Any, ...] = ()) -> Found:
         if len(frames) > 1:
             assert self.together is not None
             return self.together
         self.predicted.append(len(predicted))
         return next(self.alone)
 
-    def compose(self, frames: tuple[Frame, ...], what: Found) -> Any:
+    def compose(self, frames: tuple[EncodedFrame, ...], what: Found) -> Any:
         assert what.refined is not None
         assert what.decision is not None
         return replace(
@@ -83,7 +83,7 @@ def localizer(bundle_path):
 @pytest.fixture(scope="module")
 def frame(localizer, pictures):
     rgb, depth_m, camera = pictures
-    return localizer.look_up(Query(rgb=rgb, depth_m=depth_m, camera=camera))
+    return localizer.encode_and_search(Query(rgb=rgb, depth_m=depth_m, camera=camera))
 
 
 @pytest.fixture

@@ -12,6 +12,7 @@ from service.maps.content import UNCALIBRATED
 
 COUNT = len(FEATURES)
 PATH = "maps/town/calibration.json"
+REMEDY = "renew the calibration with `streetfix calibrate --map MAP --calibration stock`, or build the map again with this release"
 SITE = {"offset": -1.0, "queries": 200, "right": 150, "expected_calibration_error": 0.02}
 
 
@@ -20,7 +21,7 @@ def read(document):
 
 
 def refused(document, what):
-    with pytest.raises(BundleError, match=f"^{PATH}: .*{what}.*; build the map again with this release$") as error:
+    with pytest.raises(BundleError, match=f"^{PATH}: .*{what}.*; {REMEDY}$") as error:
         read(document)
     assert error.value.field == "calibration.json"
 
@@ -85,7 +86,7 @@ def test_a_map_that_says_it_is_not_calibrated_has_no_calibration():
 def test_a_document_that_is_neither_is_refused_with_the_file_the_reason_and_what_to_do(text, what):
     with pytest.raises(BundleError) as error:
         read(text)
-    assert error.value.message == f"{PATH}: {what}; build the map again with this release"
+    assert error.value.message == f"{PATH}: {what}; {REMEDY}"
     assert error.value.field == "calibration.json"
 
 

@@ -5,9 +5,9 @@ import pytest
 from service.errors import ImageSizeError, RequestError
 from service.geometry.camera import PinholeCamera
 from service.imaging.decode import decode_rgb
-from service.imaging.gather import finest_rad
 from service.imaging.raw16 import write_raw16
 from service.imaging.rectify import rectification_of
+from service.imaging.resample import finest_rad
 from service.imaging.view_grid import ViewGrid
 from service.retrieval.query import DepthFormat, Query, decoded_query
 

@@ -145,7 +145,10 @@ def test_frames_as_a_stream_keeps_them_and_as_a_sequence(localizer: Localizer, p
     queries, moved = [], []
     for given_options, name, T, ranked in drawn:
         query = Query(rgb=rgb, depth_m=depths[name], camera=camera, ranked=ranked, **given_options)
-        frames = [localizer.look_up(query), *(replace(each, T_reference_camera=np.eye(4)) for each in frames)][:5]
+        frames = [
+            localizer.encode_and_search(query),
+            *(replace(each, T_reference_camera=np.eye(4)) for each in frames),
+        ][:5]
         require_consistent(localizer.answer(tuple(frames)), query, localizer.bundle)
         queries.append(query)
         moved.append(np.eye(4) if T is None or not moved else T)

@@ -20,8 +20,8 @@ from service.geometry.rigid import Rotation
 from service.imaging.as_c import CPicture, c_picture
 from service.imaging.view_grid import ViewGrid
 
-#: Library that the build compiles from ``gather.c``.
-LIBRARY = Path(__file__).with_name("_gather.so")
+#: Library that the build compiles from ``resample.c``.
+LIBRARY = Path(__file__).with_name("_resample.so")
 #: Each cell is sampled by ``SUB_RAYS`` x ``SUB_RAYS`` rays.
 SUB_RAYS = 3
 #: A cell gets a range, the median over its rays, only if at least so many of its rays hit a measurement.
@@ -58,12 +58,12 @@ def _library() -> ctypes.CDLL:
         c_void_p,
     ]
     library = load(LIBRARY, {"Picture": CPicture}, {"SAMPLES": SUB_RAYS**2, "ARGUMENTS": len(arguments)})
-    library.streetfix_gather.argtypes = arguments
-    library.streetfix_gather.restype = None
+    library.streetfix_resample.argtypes = arguments
+    library.streetfix_resample.restype = None
     return library
 
 
-def gather(
+def resample(
     rgb: UInt8[NDArray[np.uint8], "H W 3"],
     depth_m: Float32[NDArray[np.float32], "h w"],
     camera: PinholeCamera,
@@ -106,7 +106,7 @@ def gather(
     R = np.ascontiguousarray(R_camera_view, np.float64).reshape(3, 3)
     ranges, colour = np.empty(cells, np.float32), np.empty((cells, 3), np.float32)
     seen = np.empty(cells, np.bool_)
-    _library().streetfix_gather(
+    _library().streetfix_resample(
         rays.ctypes.data,
         cells,
         R.ctypes.data,

@@ -1,4 +1,4 @@
-"""The compiled gather against the same computation in NumPy."""
+"""The compiled resample against the same computation in NumPy."""
 
 import numpy as np
 import pytest
@@ -9,8 +9,8 @@ from jaxtyping import TypeCheckError
 from service.errors import StreetfixError
 from service.geometry.camera import PinholeCamera
 from service.geometry.rigid import R_BODY_OPTICAL, rotation_z
-from service.imaging import gather as module
-from service.imaging.gather import FEWEST_SAMPLES, _sub_rays, gather
+from service.imaging import resample as module
+from service.imaging.resample import FEWEST_SAMPLES, _sub_rays, resample
 from service.imaging.view_grid import ViewGrid
 
 GRID = ViewGrid(rows=5, columns=37)  # neither a whole block of cells nor a whole number of rows in one
@@ -70,7 +70,7 @@ def test_the_kernel_equals_numpy(seed, turn, tilt, own_size, holes, unseen):
     pitch = np.array([[np.cos(tilt), 0, np.sin(tilt)], [0, 1, 0], [-np.sin(tilt), 0, np.cos(tilt)]])
     R = R_BODY_OPTICAL.T @ pitch @ rotation_z(turn)
     observed = None if unseen is None else rng.random(depth_m.shape) >= unseen
-    found = gather(rgb, depth_m, camera, R, GRID, observed)
+    found = resample(rgb, depth_m, camera, R, GRID, observed)
     expected = plain(rgb, depth_m, camera, R, GRID, observed)
     # A ray that falls just between two pixels may go either way: one of a thousand, here none or one cell.
     for one, other in zip(found, expected, strict=True):
@@ -82,7 +82,7 @@ def test_a_value_that_is_not_finite_is_no_measurement():
     camera = PinholeCamera(64, 48, 32.0, 32.0, 31.5, 23.5)
     rgb = np.full((48, 64, 3), 255, np.uint8)
     for value in (np.nan, np.inf, -np.inf, -3.0, 0.0, 1e30):
-        ranges, colour, seen = gather(rgb, np.full((48, 64), value, np.float32), camera, R_BODY_OPTICAL.T, GRID)
+        ranges, colour, seen = resample(rgb, np.full((48, 64), value, np.float32), camera, R_BODY_OPTICAL.T, GRID)
         assert not ranges.any()
         assert seen.any()
         np.testing.assert_array_equal(np.unique(colour[seen]), 255)
@@ -92,7 +92,7 @@ def test_a_value_that_is_not_finite_is_no_measurement():
 @pytest.mark.parametrize("centre", [-1e6, 1e6])
 def test_absurd_intrinsics_read_no_pixel_that_is_not_there(focal, centre):
     camera = PinholeCamera(64, 48, focal, focal, centre, centre)
-    ranges, _, seen = gather(
+    ranges, _, seen = resample(
         np.zeros((48, 64, 3), np.uint8), np.ones((48, 64), np.float32), camera, R_BODY_OPTICAL.T, GRID
     )
     assert ranges.shape == seen.shape == (GRID.rows, GRID.columns)
@@ -103,7 +103,7 @@ def test_a_cell_that_only_meets_unobserved_pixels_is_empty():
     camera = PinholeCamera(64, 48, 32.0, 32.0, 31.5, 23.5)
     observed = np.repeat(np.arange(64)[None] < 32, 48, axis=0)
     rgb, depth_m = np.full((48, 64, 3), 200, np.uint8), np.full((48, 64), 5, np.float32)
-    ranges, colour, seen = gather(rgb, depth_m, camera, R_BODY_OPTICAL.T, ViewGrid(rows=5, columns=36), observed)
+    ranges, colour, seen = resample(rgb, depth_m, camera, R_BODY_OPTICAL.T, ViewGrid(rows=5, columns=36), observed)
     assert seen[:, :17].all()
     assert (colour[:, :17] == 200).all()
     assert not seen[:, 19:].any()
@@ -114,7 +114,7 @@ def test_a_cell_that_only_meets_unobserved_pixels_is_empty():
 def test_pictures_that_are_none_are_refused():
     camera = PinholeCamera(64, 48, 32.0, 32.0, 31.5, 23.5)
     with pytest.raises((ValueError, TypeCheckError)):
-        gather(
+        resample(
             np.zeros((48, 64, 3), np.uint8),
             np.ones((48, 64), np.float32),
             camera,
@@ -123,12 +123,12 @@ def test_pictures_that_are_none_are_refused():
             np.ones((9, 9), bool),
         )
     with pytest.raises((ValueError, TypeCheckError)):  # whichever looks first
-        gather(np.zeros((48, 64), np.uint8), np.ones((48, 64), np.float32), camera, R_BODY_OPTICAL.T, GRID)
+        resample(np.zeros((48, 64), np.uint8), np.ones((48, 64), np.float32), camera, R_BODY_OPTICAL.T, GRID)
 
 
 def test_a_missing_library_says_what_to_do(monkeypatch, tmp_path):
-    monkeypatch.setattr(module, "LIBRARY", tmp_path / "_gather.so")
+    monkeypatch.setattr(module, "LIBRARY", tmp_path / "_resample.so")
     module._library.cache_clear()
-    with pytest.raises(StreetfixError, match=r"_gather\.so is missing .* install the package again"):
+    with pytest.raises(StreetfixError, match=r"_resample\.so is missing .* install the package again"):
         module._library()
     module._library.cache_clear()
