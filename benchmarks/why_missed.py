@@ -80,10 +80,11 @@ _OVER_BARE = (
     "read wakes the event loop while the worker computes"
 )
 _CONFIDENCE_0013 = (
-    "23 of the 24 forced answers are within 1 m, and 7 of these are refused. No accepted answer is wrong. On drive 0005 no "
-    "answer is refused (26 of 26). Confidence was fitted on simulated city streets. This drive has trees, hedges and parked "
-    "cars instead of facades. It serves reports only, so we did not look at its confidence features. The simulator has such "
-    "districts (`mixed`), but the calibration data do not contain them yet"
+    "21 of the 24 forced answers are within 1 m, and 7 of these are refused. No accepted answer is wrong. On drive 0005 one of 26 is "
+    "refused. Confidence was fitted on simulated streets. This drive has trees, hedges and parked cars instead of facades. It serves "
+    "reports only, so we did not look at its confidence features. On 26 November 23 forced answers were right, with the earlier encoder "
+    "and without depth structure, and also 7 of these were refused. So decision 0165, which raises drive 0005 with thinned surveys from "
+    "0.92 to 0.98, gains nothing here"
 )
 _PEERS = (
     "The best peer is MLServer. With eight clients its processor time is 35.3 ms for a full request and 10.0 ms for retrieval. "
@@ -116,23 +117,22 @@ WHY_MISSED: dict[str, Reason] = {
     "retrieval.paper_city.stereo.street_accuracy": Reason(0.9399361, _LOOK_ALIKES),
     "retrieval.paper_city.stereo.recall_at_1_5m": Reason(0.9408946, _LOOK_ALIKES),
     "full.unseen.precise.within_0_5_m": Reason(
-        0.9866667,
-        "16 of 3,000 queries have a forced error above 1 m, 8 of these above 5 m. 25 answers are refused, 15 of them right. 9 "
-        "accepted answers are between 0.5 and 1 m off, and 6 between 1 and 5 m. None is farther off. Tried last: depth "
-        "structure as a scorer (decision 0159). Next step: use brightness already when few points select the candidates",
+        0.986,
+        "16 of 3,000 queries have a forced error above 1 m, 8 of these above 5 m. 26 answers are refused, 17 of them right. 9 "
+        "accepted answers are between 0.5 and 1 m off, and 7 between 1 and 5 m. None is farther off. Tried last: comparison with poses "
+        "further along the street (decision 0165). Next step: use brightness already when few points select the candidates",
     ),
     "full.unseen.stereo.within_1_m": Reason(
-        0.936,
-        "Confidence causes most losses. 59 of 3,000 queries have a forced error above 1 m. 181 answers are refused, and 133 of these "
-        "are right: a LOCALIZED answer needs a confidence of 0.9, and 77 of the 133 have 0.65 to 0.9. 11 accepted answers are wrong "
-        "(0.4 %), none by more than 5 m. The value before (0.970) is of the earlier default, which accepted 29 wrong answers and 8 % of "
-        "the images of another city. Now it accepts none of those. Mean confidence is 0.964, and 0.980 are right. Next step: a fit "
-        "that trusts the margin to the best rival more where depth is noisy",
+        0.9453333,
+        "Confidence causes most losses. 59 of 3,000 queries have a forced error above 1 m. 156 answers are refused, and 105 of these "
+        "are right: a LOCALIZED answer needs a confidence of 0.9, and 59 of the 105 have 0.65 to 0.9. 8 accepted answers are wrong "
+        "(0.3 %), none by more than 5 m. An earlier default reached 0.970, but accepted 29 wrong answers and 8 % of the images of another "
+        "city (now 0.2 %). Decision 0165 raised the value from 0.936. Tried: other models, 60 numbers of the image (decision 0165)",
     ),
     "doubt.expected_calibration_error": Reason(
-        0.0324045,
+        0.0291455,
         "Stereo depth causes it: the confidence is too low for right answers. In the three unseen cities without further "
-        "difficulties the calibration error is 0.003 with precise and 0.016 with stereo depth. The reason is that of "
+        "difficulties the calibration error is 0.004 with precise and 0.012 with stereo depth. The reason is that of "
         "full.unseen.stereo.within_1_m",
     ),
     "full.paper_city.precise.street_accuracy": Reason(
@@ -164,7 +164,7 @@ WHY_MISSED: dict[str, Reason] = {
         "separately",
     ),
     "doubt.sigma_coverage_gap": Reason(
-        0.1278974,
+        0.1297645,
         "The worst case is the position along the street with stereo depth. Too many errors are within one standard deviation, "
         "because the tails make the standard deviation large (see doubt.covariance_95_coverage). Next step: let the map build "
         "estimate the errors of the map",
@@ -182,10 +182,10 @@ WHY_MISSED: dict[str, Reason] = {
     "height.3.5.given.within_1_m": Reason(0.93, _HEIGHTS),
     "real.kitti_0013.recall_at_1_10m": Reason(
         0.9583333,
-        "One of 24 queries misses. With 24 queries the bar allows no miss. Retrieval alone finds 17 within 5 m, and "
-        "registration finds the other six",
+        "One of 24 queries misses. With 24 queries the bar allows no miss. Retrieval alone finds 18 within 5 m, and "
+        "registration finds the other five",
     ),
-    "real.kitti_0013.answered_within_1_m": Reason(0.6666667, _CONFIDENCE_0013),
+    "real.kitti_0013.answered_within_1_m": Reason(0.5833333, _CONFIDENCE_0013),
     "real.kitti_0013.inliers_at_truth": Reason(
         0.4230152,
         "On drive 0005 (0.416), 26 % of the points have no map surfel near them. The HDL-64 sees nothing above 2 degrees, but "
@@ -193,9 +193,9 @@ WHY_MISSED: dict[str, Reason] = {
         "a share of 0.68 there, or fewer unmapped points",
     ),
     "real.sequence5.kitti_0013.answered_within_1_m": Reason(
-        0.85,
-        "All 20 forced answers are within 1 m, and 3 of them are refused. No accepted answer is wrong. "
-        + _CONFIDENCE_0013,
+        0.9,
+        "All 20 forced answers are within 1 m, and 2 of them are refused. No accepted answer is wrong. "
+        "The reason is that of real.kitti_0013.answered_within_1_m",
     ),
     "real.strangers.accepted": Reason(
         0.04,
@@ -295,7 +295,7 @@ WHY_MISSED["town.build_peak_gib"] = Reason(
     "smaller sums of voxels, with counts of 16 bits",
 )
 WHY_MISSED["town.kb_per_metre"] = Reason(
-    66.23340464530573,
+    66.23347362529734,
     "Surfels take 34.7 kB, the grid of the nearest surfel 15.1 kB, descriptors with their coarse copy 7.8 kB. The margins of ten tiles "
     "store surfels near their edges twice: without tiles the map has 45.9 kB (decision 0155). Next step: surfels of 16 bytes relative to "
     "their tile",
@@ -310,14 +310,15 @@ WHY_MISSED["town.precise.wrong_and_accepted"] = Reason(
     "Two of 500 answers. The default allows one wrong answer among a hundred LOCALIZED ones",
 )
 WHY_MISSED["town.stereo.within_1_m"] = Reason(
-    0.9,
-    "Confidence causes most losses: 485 of 500 answers are within 1 m when forced, and 35 of these are refused. "
+    0.906,
+    "Confidence causes most losses: 485 of 500 answers are within 1 m when forced, and 32 of these are refused. "
     "None is accepted and wrong. "
     "The reason is that of full.unseen.stereo.within_1_m",
 )
 WHY_MISSED["town.sequence5.stereo.within_1_m"] = Reason(
-    0.88,
-    "98 of 100 sequences are within 1 m when forced, and ten of these are refused: a LOCALIZED answer needs a confidence of 0.9",
+    0.94,
+    "98 of 100 sequences are within 1 m when forced, and four of these are refused: a LOCALIZED answer needs a confidence of 0.9. Decision "
+    "0165 raised the value from 0.88",
 )
 WHY_MISSED["train.two_process_loss_gap"] = Reason(
     0.05326234099074938,
@@ -328,7 +329,8 @@ WHY_MISSED["train.two_process_loss_gap"] = Reason(
 _RIGS = {
     "ece": (
         "The family lies outside the range of the others, and few of its answers are LOCALIZED (decision 0149). Half of the places between "
-        "repeating blocks cannot be told apart. Depth structure lowers the D435 from 0.132 to 0.099 (decision 0159)"
+        "repeating blocks cannot be told apart. Depth structure lowers the D435 from 0.132 to 0.099 (decision 0159), the comparison with "
+        "poses further along the street to 0.068 (decision 0165)"
     ),
     "within_1_m": (
         "Most of the wrong answers are in another place. Cameras of small robots see little: depth ends at 5 to 12 m, or the baseline is "
@@ -340,12 +342,12 @@ _RIGS = {
         "A LOCALIZED answer needs a confidence of 0.9, with every second query from outside the map. A rate of 0.02 accepts most of these "
         "answers. ZED 2 and D435 are refused because their noise lies outside the range of the other families; the shipped calibration "
         "contains them. Tried: 12 sets of features, products, brightness (decision 0149), the encoder of decision 0154, depth structure "
-        "(decision 0159), which lowers the car from 0.27 to 0.19 and the robot from 0.30 to 0.24"
+        "(decision 0159: car 0.27 -> 0.19, robot 0.30 -> 0.24), poses further along the street (decision 0165: car 0.13, robot 0.21)"
     ),
     "wrong_of_localized": (
         "Without this family the fit knows no scale error of 8 % (monocular), no survey with a scan every 5 m in suburbs, or no depth that "
-        "ends at 12 m or has a small baseline (D435: 1 of 79, OAK-D: 2 of 12, robot: 4 of 317). Blocks that are alike fool the depth "
-        "structure (decision 0159)"
+        "ends at 12 m or has a small baseline (D435: 2 of 100, monocular: 2 of 166, OAK-D: 2 of 17, robot: 6 of 331). Blocks that are "
+        "alike fool the depth structure (decision 0159)"
     ),
     "covariance_95_coverage": (
         "The interval has two sides. Half of the errors are smaller than the covariance says, and 6 to 14 % of the answers are outside: a "
@@ -358,7 +360,7 @@ _RIGS = {
         "minimum of a few. Up it is too large where the survey is better than stated, and too small for monocular depth, whose scale errs "
         "by 8 %"
     ),
-    "worst_ece": "Sparse rings of a LiDAR. No fit contains them, and the service refuses their answers as out of range. D435: 0.099",
+    "worst_ece": "Sparse rings of a LiDAR. No fit contains them, and the service refuses their answers as out of range. D435: 0.068",
     "worst_within_1_m": (
         "OAK-D with semi-global matching, 0.5 m above the ground: at 33 px m an error of 0.25 px is 0.8 m at 10 m. Training on random rigs "
         "raised it from 0.03 to 0.15 (decision 0154). Of the rigs that the calibration is fitted to, the D435 has the least (0.61)"
@@ -367,27 +369,25 @@ _RIGS = {
 #: Values of these rows.
 _RIG_VALUES = {
     "rigs.car.covariance_95_coverage": 0.8787878787878788,
-    "rigs.car.right_but_refused": 0.188,
+    "rigs.car.right_but_refused": 0.134,
     "rigs.car.sigma_coverage_gap": 0.13085281385281378,
     "rigs.car.within_1_m": 0.924,
     "rigs.car_sparse.covariance_95_coverage": 0.8571428571428571,
-    "rigs.car_sparse.right_but_refused": 0.192,
+    "rigs.car_sparse.right_but_refused": 0.144,
     "rigs.car_sparse.sigma_coverage_gap": 0.19972921108742003,
     "rigs.car_sparse.within_1_m": 0.938,
     "rigs.d435.covariance_95_coverage": 0.7467105263157895,
-    "rigs.d435.ece": 0.09924976195207438,
-    "rigs.d435.right_but_refused": 0.452,
+    "rigs.d435.ece": 0.06790452383115571,
+    "rigs.d435.right_but_refused": 0.412,
     "rigs.d435.sigma_coverage_gap": 0.1788421052631578,
     "rigs.d435.within_1_m": 0.608,
-    "rigs.d435.wrong_of_localized": 0.012658227848101266,
+    "rigs.d435.wrong_of_localized": 0.02,
     "rigs.d455.covariance_95_coverage": 0.8385093167701864,
     "rigs.d455.sigma_coverage_gap": 0.1720724637681159,
     "rigs.d455.within_1_m": 0.966,
     "rigs.every_10_m.covariance_95_coverage": 0.8228105906313645,
-    "rigs.every_10_m.right_but_refused": 0.052,
     "rigs.every_10_m.sigma_coverage_gap": 0.14388391038696535,
     "rigs.four_cameras.covariance_95_coverage": 0.7214428857715431,
-    "rigs.four_cameras.right_but_refused": 0.118,
     "rigs.four_cameras.sigma_coverage_gap": 0.23209819639278562,
     "rigs.iphone.covariance_95_coverage": 0.47619047619047616,
     "rigs.iphone.sigma_coverage_gap": 0.34966666666666674,
@@ -402,43 +402,40 @@ _RIG_VALUES = {
     "rigs.lorry.sigma_coverage_gap": 0.06464718162839245,
     "rigs.lorry.within_1_m": 0.96,
     "rigs.monocular.covariance_95_coverage": 0.3948051948051948,
-    "rigs.monocular.ece": 0.06751494618834789,
-    "rigs.monocular.right_but_refused": 0.446,
+    "rigs.monocular.ece": 0.08154311514130973,
+    "rigs.monocular.right_but_refused": 0.444,
     "rigs.monocular.sigma_coverage_gap": 0.39468831168831175,
     "rigs.monocular.within_1_m": 0.772,
-    "rigs.monocular.wrong_of_localized": 0.02976190476190476,
+    "rigs.monocular.wrong_of_localized": 0.012048192771084338,
     "rigs.narrow.covariance_95_coverage": 0.8457583547557841,
-    "rigs.narrow.right_but_refused": 0.06125,
     "rigs.narrow.sigma_coverage_gap": 0.13191002570694077,
     "rigs.oak_d.covariance_95_coverage": 0.7974683544303798,
-    "rigs.oak_d.right_but_refused": 0.138,
+    "rigs.oak_d.right_but_refused": 0.128,
     "rigs.oak_d.sigma_coverage_gap": 0.13978481012658228,
     "rigs.oak_d.within_1_m": 0.158,
-    "rigs.oak_d.wrong_of_localized": 0.16666666666666666,
+    "rigs.oak_d.wrong_of_localized": 0.11764705882352941,
     "rigs.precise.covariance_95_coverage": 0.8325581395348837,
     "rigs.precise.sigma_coverage_gap": 0.07668992248062012,
     "rigs.precise.within_1_m": 0.9436722750548646,
     "rigs.repeating.covariance_95_coverage": 0.5524861878453039,
-    "rigs.repeating.ece": 0.25179978116049717,
-    "rigs.repeating.right_but_refused": 0.1525,
+    "rigs.repeating.ece": 0.2889083564301386,
+    "rigs.repeating.right_but_refused": 0.1375,
     "rigs.repeating.sigma_coverage_gap": 0.12527071823204416,
     "rigs.repeating.within_1_m": 0.4525,
-    "rigs.repeating.wrong_of_localized": 0.024390243902439025,
+    "rigs.repeating.wrong_of_localized": 0.03076923076923077,
     "rigs.rings.ece": 0.12037037037037036,
     "rigs.rings.right_but_refused": 0.26,
     "rigs.rings.within_1_m": 0.26,
     "rigs.robot.covariance_95_coverage": 0.8758620689655172,
-    "rigs.robot.right_but_refused": 0.23461538461538461,
+    "rigs.robot.right_but_refused": 0.21153846153846154,
     "rigs.robot.sigma_coverage_gap": 0.1652758620689655,
     "rigs.robot.within_1_m": 0.8365384615384616,
-    "rigs.robot.wrong_of_localized": 0.012618296529968454,
+    "rigs.robot.wrong_of_localized": 0.01812688821752266,
     "rigs.stereo.covariance_95_coverage": 0.8100961538461539,
-    "rigs.stereo.right_but_refused": 0.06583760058522312,
+    "rigs.stereo.right_but_refused": 0.0548646671543526,
     "rigs.stereo.sigma_coverage_gap": 0.11988461538461537,
     "rigs.stereo.within_1_m": 0.9129480614484272,
-    "rigs.stereo.wrong_of_localized": 0.010256410256410256,
     "rigs.vlp_16.covariance_95_coverage": 0.7955465587044535,
-    "rigs.vlp_16.right_but_refused": 0.052,
     "rigs.vlp_16.sigma_coverage_gap": 0.19756680161943319,
     "rigs.zed2.covariance_95_coverage": 0.8459302325581395,
     "rigs.zed2.right_but_refused": 0.69,
