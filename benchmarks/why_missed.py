@@ -252,10 +252,10 @@ WHY_MISSED: dict[str, Reason] = {
         "fields (8 to 7). A sixth file would merge two tasks, or take the camera checks out of the schema that the client uses too",
     ),
     "request.files_in_core": Reason(
-        54,
-        "The count includes every file whose functions one request calls. 12 decode, level and fuse images, 6 retrieve, 6 register, 8 "
+        55,
+        "The count includes every file whose functions one request calls. 12 decode, level and fuse images, 6 retrieve, 6 register, 9 "
         "score, 4 decide, 4 build the answer, 5 read the map, 2 are geometry, 7 belong to the engine. Tried: packages by stage with small "
-        "files joined (56 to 53; depth structure is one more). The others have readers of their own or several users. 20 files would hold "
+        "files joined (56 to 53; depth structure and confirmation are two more). The others have readers of their own or several users. 20 files would hold "
         "several subjects each",
     ),
 }
@@ -265,9 +265,9 @@ WHY_MISSED["docs.code_blocks_run"] = Reason(
     "Two commands of docs/robot.md named no service, so the run started none for them. They name it since this run",
 )
 WHY_MISSED["sequence.landmark.within_1_m"] = Reason(
-    0.3333333333333333,
-    "All 72 answers are within 1 m when forced, but 48 are AMBIGUOUS: their median confidence is 0.80, and the default needs 0.9 since "
-    "decision 0149. The repeating street is one of the families of the calibration, and half of its answers are wrong, so equal blocks "
+    0.4861111111111111,
+    "37 of 72 answers are refused, because the default needs a confidence of 0.9 since "
+    "decision 0149. Decision 0165 accepts 35 instead of 24 of them. The repeating street is one of the families of the calibration, and half of its answers are wrong, so equal blocks "
     "lower the confidence. Tried: a better encoder (decision 0154), depth structure (decision 0159; 50 -> 48). Next: a feature that "
     "tells a landmark from a repeated block",
 )

@@ -82,7 +82,7 @@ def confirmation_of(
     Args:
         image: depth of the query.
         here_m: depth of the map at the pose, seen by ``CAMERA``, m; 0 where nothing is mapped.
-        along_m: the same at poses further along the street.
+        along_m: the same at poses further along the street, m.
         scale: factor from measured to true depth.
         offset: disparity offset, px.
     """
