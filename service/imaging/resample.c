@@ -61,8 +61,8 @@ static const int NETWORK[25][2] = {{0, 1}, {3, 4}, {6, 7}, {1, 2}, {4, 5}, {7, 8
  * min_range, max_range: metres. fewest: rays with a measurement that a range needs.
  * Output: ranges (metres, 0 without a range) and seen have one value per cell, colour (0..255) has cells x 3 values. */
 void streetfix_resample(const float *rays, int64_t cells, const double *R, const float *depth, const Picture *depth_picture,
-                      const uint8_t *observed, const uint8_t *rgb, const Picture *rgb_picture, double min_range, double max_range,
-                      int64_t fewest, float *ranges, float *colour, uint8_t *seen)
+                        const uint8_t *observed, const uint8_t *rgb, const Picture *rgb_picture, double min_range, double max_range,
+                        int64_t fewest, float *ranges, float *colour, uint8_t *seen)
 {
     float r[9];
     for (int k = 0; k < 9; k++) r[k] = (float)R[k];
