@@ -92,7 +92,7 @@ def command(
 ) -> None:
     """Fit the confidence of an encoder on calibration cities, or correct or renew the confidence of a map.
 
-    The first simulates the cities, which takes about two hours. A correction takes seconds to minutes, and a renewal no time.
+    The first simulates the cities, which takes about two hours. A correction takes seconds to minutes, a renewal a second.
 
     \b
     Examples:

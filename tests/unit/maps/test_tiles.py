@@ -11,17 +11,19 @@ from typing import Any
 import numpy as np
 import pytest
 
+from model_training.mapping.calibration_file import renew_calibration
 from model_training.mapping.join import of_places
 from model_training.mapping.stored_map import content_of
+from model_training.stock import CALIBRATION
 from service.errors import BundleError
 from service.localization.localizer import Localizer
 from service.maps import tiles as tiles_module
-from service.maps.calibration import Site
+from service.maps.calibration import Site, read_calibration
 from service.maps.manifest import read_manifest
 from service.maps.reader import MapBundle
 from service.maps.tiled_writer import joined_site, write_tiled
 from service.maps.tiles import LocalTiles, TiledMap, in_order, open_map
-from service.maps.writer import write_bundle
+from service.maps.writer import replace_calibration, write_bundle
 from service.registration.surfel_tiles import nearest_square
 from service.retrieval.prior import Prior
 
@@ -334,3 +336,22 @@ def test_tiles_at_positions(tiled: TiledMap) -> None:
 def test_local_tiles_lie_in_the_folder_of_the_map(tiled: TiledMap) -> None:
     tile = tiled.manifest.tiles[0]
     assert LocalTiles(tiled.path).folder(tile) == tiled.path / "tiles" / tile.version
+
+
+def test_a_renewed_tiled_map_keeps_its_tiles_and_opens(tiled_copy: Path) -> None:
+    """The stock calibration replaces one of other features, without a new build."""
+    before = read_manifest(tiled_copy)
+    old = json.loads((tiled_copy / "calibration.json").read_bytes())
+    replace_calibration(tiled_copy, old | {"features": [{"name": "of_old", "mean": 0.0, "std": 1.0}]})
+    with pytest.raises(BundleError, match="renew the calibration"):
+        Localizer.open(TiledMap.open(tiled_copy))
+    made, had_rig = renew_calibration(tiled_copy, CALIBRATION)
+    opened = TiledMap.open(tiled_copy)
+    Localizer.open(opened)
+    assert not had_rig
+    assert made.tiles == before.tiles
+    expected = read_calibration(CALIBRATION.read_bytes(), path=str(CALIBRATION))
+    assert opened.calibration is not None
+    assert expected is not None
+    assert opened.calibration.right == expected.right
+    assert opened.calibration.names == expected.names
