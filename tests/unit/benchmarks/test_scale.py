@@ -118,8 +118,7 @@ def test_the_time_of_a_search_is_that_of_one_query(real: RealDescriptors) -> Non
 
 
 def test_copies_of_a_town_lie_apart_and_share_the_scans(small_dataset: Dataset, tmp_path: Path) -> None:
-    town = small_dataset
-    stamps, poses = town.survey_trajectory()
+    town, poses = small_dataset, small_dataset.survey_poses()
     both = copied(town, tmp_path / "both", 2)
     copied_stamps, copied_poses = both.survey_trajectory()
     assert len(copied_poses) == 2 * len(poses)
