@@ -1,6 +1,7 @@
 """Draw batches of pairs of one city. The caller may choose some pairs, to get hard negatives.
 
-A GPU holds whole packs in its memory. Views that a CPU cuts out and copies to it take seven times as long as a training step (decision 0166).
+A GPU holds whole packs in its memory. Views that a CPU cuts out and copies to it take seven times as long as a training step
+(decision 0166).
 """
 
 from dataclasses import dataclass
