@@ -16,7 +16,7 @@ PAPER_STEPS ?= 400
 DATA ?= ../shared/data/kitti_stereo
 
 # Compiled when the package is installed.
-C_CODE := $(wildcard service/*.h service/*/*.c service/*/*.h)
+C_CODE := $(wildcard service/*.h service/*/*.c service/*/*.h model_training/*/*.c)
 KERNEL := native/CMakeLists.txt native/build_backend.py $(C_CODE)
 
 # The console's page, and the browser's driver in its tests.

@@ -24,6 +24,7 @@ TESTS = tuple(
     for folder, names in {
         "imaging": ("decode_depth", "resample", "level", "png16", "ros_depth"),
         "registration": ("align", "gradients", "nearest_grid", "points", "rays", "render", "visibility"),
+        "mapping": ("passes", "voxel_map"),
     }.items()
     for name in names
 )

@@ -2,10 +2,10 @@
 
 Each query is asked twice: in the map, and in the map without the places around it. So half of the weight lies on out-of-map
 queries. No real recording took part in the calibration. The calibration for the rig is cross-validated over blocks of
-consecutive frames.
+consecutive frames. The correction of one drive is also applied to the other drive, which took no part in it.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -13,11 +13,15 @@ from benchmarks.report import Report
 from model_training.calibration.own_drive import frames_of_drive
 from model_training.calibration.own_rig import learn_correction
 from model_training.datasets.dataset import Dataset
+from model_training.evaluation.failures import position_errors
+from model_training.evaluation.predict import Predictions
 from service.errors import BundleError
 from service.localization.localizer import Localizer
+from service.maps.calibration import RIGHT_M, RigCorrection
 
-#: Bars of issue 38 (docs/decisions): calibration error without and with a calibration for the rig.
-_ECE, _AFTER = 0.10, 0.05
+#: Bars of issue 38 (docs/decisions): calibration error without and with a calibration for the rig. With the correction of another drive:
+#: wrong answers of the accepted ones, and right answers that are refused, of all queries.
+_ECE, _AFTER, _WRONG, _REFUSED = 0.10, 0.05, 0.02, 0.05
 
 
 @dataclass(frozen=True)
@@ -28,11 +32,13 @@ class CalibrationErrors:
         frames: number of queries, in the map and outside it.
         before: expected calibration error of the map's calibration.
         after: the same with the correction for the rig, cross-validated.
+        correction: the correction that all queries together give.
     """
 
     frames: int
     before: float
     after: float
+    correction: RigCorrection
 
 
 def confidence_rows(
@@ -55,10 +61,51 @@ def confidence_rows(
         raise BundleError(f"{localizer.bundle.path}: the map has no calibration, so there is no confidence to measure")
     found = frames_of_drive(localizer, dataset, [queries], odometry_noise=0.0)
     learned = learn_correction(calibration, found.frames, source="drive", measured_on=found.described)
-    errors = CalibrationErrors(len(found.frames), learned.error_before, learned.error_after)
+    errors = CalibrationErrors(len(found.frames), learned.error_before, learned.error_after, learned)
     report.row(f"real.{name}.ece", errors.before, "share", better="lower", n=errors.frames)
     report.row(f"real.{name}.ece_after_rig_calibration", errors.after, "share", better="lower", n=errors.frames)
     return errors
+
+
+def with_correction(localizer: Localizer, correction: RigCorrection) -> Localizer:
+    """Return a localizer with the correction of a rig in its calibration.
+
+    Args:
+        localizer: localizer of a map with a calibration.
+        correction: the correction.
+
+    Raises:
+        BundleError: the map has no calibration.
+    """
+    calibration = localizer.bundle.calibration
+    if calibration is None:
+        raise BundleError(f"{localizer.bundle.path}: the map has no calibration that a correction could apply to")
+    bundle = replace(localizer.bundle, calibration=calibration.model_copy(update={"rig": correction}))
+    return Localizer(bundle, localizer.encoder, clusters=localizer.clusters, refining=localizer.refining)
+
+
+def calibrated_elsewhere_rows(report: Report, learned_on: str, correction: RigCorrection, found: Predictions) -> None:
+    """Add the rows of a drive whose map has the correction of another drive.
+
+    Args:
+        report: receives the rows.
+        learned_on: name of the drive that the correction comes from, part of the row ids.
+        correction: the correction.
+        found: answers with the correction; one at least.
+    """
+    row, right = f"real.calibrated_on_{learned_on}", position_errors(found) <= RIGHT_M
+    told = f"scale {correction.scale:.2f}, offset {correction.offset:+.2f}"
+    wrong = found.localized & ~right
+    report.row(
+        f"{row}.wrong_of_localized",
+        float(wrong.sum() / max(1, found.localized.sum())),
+        "share",
+        bar=_WRONG,
+        better="lower",
+        n=int(found.localized.sum()),
+        why=told,
+    )
+    report.share(f"{row}.right_but_refused", right & ~found.localized, bar=_REFUSED, better="lower")
 
 
 def pooled_confidence_rows(report: Report, drives: list[CalibrationErrors]) -> None:

@@ -13,7 +13,12 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.real.confidence import confidence_rows, pooled_confidence_rows
+from benchmarks.real.confidence import (
+    calibrated_elsewhere_rows,
+    confidence_rows,
+    pooled_confidence_rows,
+    with_correction,
+)
 from benchmarks.real.peers import peer_rows, pooled_rows
 from benchmarks.report import Report
 from model_training.datasets.dataset import Dataset
@@ -78,6 +83,10 @@ def street_rows(report: Report, data: Path, work: Path, drives: tuple[str, ...] 
             sequence_rows(report, street.name, street.dataset, street.localizer)
     pooled_rows(report, others)
     pooled_confidence_rows(report, calibrated)
+    if [street.name for street in streets] == list(DRIVES):
+        correction, other = calibrated[0].correction, streets[1]
+        answers = predict(with_correction(other.localizer, correction), other.dataset, QUERIES)
+        calibrated_elsewhere_rows(report, streets[0].name.removeprefix("kitti_"), correction, answers)
     accepted = [
         predict(own.localizer, other.dataset, QUERIES).localized
         for own in streets

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from benchmarks.report import ROOT, Report
 from benchmarks.runs import SIMULATION, Runs, code_hash
-from benchmarks.scale.built import built_rows
+from benchmarks.scale.built import built_rows, four_towns_row, timed_plan
 from benchmarks.scale.drawn import DrawnViews
 from benchmarks.scale.search import SIZES, search_rows
 from benchmarks.scale.served import served_rows
@@ -26,7 +26,7 @@ from service.maps.index import vectors_of
 from service.retrieval.encoder import Encoder
 
 #: Parts of the report.
-PARTS = ("search", "served", "built", "store", "town")
+PARTS = ("search", "served", "built", "memory", "store", "town")
 #: Code that determines the real descriptors.
 _DESCRIBING = (*SIMULATION, "service/imaging", "benchmarks/scale/sources.py", "model_training/mapping/places.py")
 
@@ -67,7 +67,8 @@ def main() -> None:
         choices=PARTS,
         default=list(PARTS),
         help="what to measure: search in drawn maps, requests with a prior on a tiled map (served), tiled builds that are killed, and both "
-        "engines (built), a map in object storage (store), a town of 20 km, which takes an hour (town)",
+        "engines (built), the memory that a build of four small towns takes (memory), a map in object storage (store), a town of 20 km, "
+        "which takes an hour (town)",
     )
     parser.add_argument(
         "--stored",
@@ -91,6 +92,10 @@ def main() -> None:
         report.write()
     if "built" in arguments.only:
         built_rows(report, Runs(arguments.work, ENCODER))
+        report.write()
+    if "memory" in arguments.only:
+        runs = Runs(arguments.work, ENCODER)
+        four_towns_row(report, runs.dataset(timed_plan()), arguments.work / "tiles")
         report.write()
     if "store" in arguments.only:
         path, dataset = arguments.stored or small_city(Runs(arguments.work, ENCODER))

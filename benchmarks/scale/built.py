@@ -1,4 +1,4 @@
-"""Tiled builds: the same map although processes are killed, and the throughput of Ray against processes of this machine."""
+"""Tiled builds: the same map although processes are killed, Ray against processes of this machine, and memory for four towns."""
 
 import importlib.util
 import os
@@ -11,9 +11,12 @@ import time
 from contextlib import suppress
 from pathlib import Path
 
+import numpy as np
+
 from benchmarks.report import ROOT, Report
 from benchmarks.runs import Runs
-from model_training.datasets.dataset import Dataset
+from benchmarks.scale.town import watched_build
+from model_training.datasets.dataset import Dataset, scan_path, write_tum
 from model_training.mapping.build_tiled import build_tiled
 from model_training.mapping.engines import Engine
 from model_training.mapping.settings import BuildSettings
@@ -28,7 +31,9 @@ BARRED = {"build.kill_runs_identical": "runs", "build.ray_over_local_throughput"
 RUNS = 20
 #: Rounds of each engine. The fastest one counts.
 ROUNDS = 2
-#: Edge of the tiles of both cities, metres.
+#: Towns of the comparison of memory, and the distance between them, metres.
+TOWNS, APART_M = 4, 2000.0
+#: Edge of the tiles of all these maps, metres.
 _TILE_M = 60.0
 
 
@@ -40,7 +45,12 @@ def built_rows(report: Report, runs: Runs) -> None:
         runs: simulates the cities, or reuses them.
     """
     _killed(report, runs.dataset(_plan("killed-tiles", 60, (60.0, 60.0), ("1",))), runs.work / "tiles")
-    _against_ray(report, runs.dataset(_plan("timed-tiles", 61, (150.0, 150.0), ())), runs.work / "tiles")
+    _against_ray(report, runs.dataset(timed_plan()), runs.work / "tiles")
+
+
+def timed_plan() -> SimulationPlan:
+    """Plan the small town whose build is timed, and whose memory is compared with that of four towns."""
+    return _plan("timed-tiles", 61, (150.0, 150.0), ())
 
 
 def _plan(name: str, seed: int, size_m: tuple[float, float], streets: tuple[str, ...]) -> SimulationPlan:
@@ -143,3 +153,57 @@ def _against_ray(report: Report, dataset: Dataset, work: Path) -> None:
         n=ROUNDS,
         why=f"{local_s:.0f} s with processes, {ray_s:.0f} s with Ray, {len(made.tiles)} tiles, {cores} cores; versions are {equal}",
     )
+
+
+def four_towns_row(report: Report, town: Dataset, work: Path) -> None:
+    """Compare the peak memory of the build of four towns with that of one.
+
+    Args:
+        report: collects the row.
+        town: dataset of one town.
+        work: folder for the builds; it is removed.
+    """
+    shutil.rmtree(work, ignore_errors=True)
+    four = copied(town, work / "four", TOWNS)
+    peaks = [
+        watched_build(each, work / f"{name}-map", tile_m=_TILE_M)[1] for name, each in (("one", town), ("four", four))
+    ]
+    scans = len(town.survey_poses())
+    report.row(
+        "town.build_peak_four_towns_over_one",
+        peaks[1] / peaks[0],
+        "ratio",
+        bar=1.1,
+        better="lower",
+        n=TOWNS,
+        why=f"{peaks[1] / 2**20:.0f} over {peaks[0] / 2**20:.0f} MiB; a small town of {scans} scans in tiles of {_TILE_M:g} m",
+    )
+    shutil.rmtree(work)
+
+
+def copied(town: Dataset, folder: Path, count: int) -> Dataset:
+    """Write a dataset of several copies of a town, ``APART_M`` apart along x. Its scans are links to those of the town.
+
+    Args:
+        town: dataset of the town.
+        folder: folder to write.
+        count: number of copies.
+    """
+    scans = folder / "survey" / "scans"
+    scans.mkdir(parents=True)
+    shutil.copy(town.folder / "dataset.json", folder)
+    stamps, T_map_lidar = town.survey_trajectory()
+    every_s = float(stamps[-1] - stamps[0]) + 60.0
+    moved = []
+    for copy in range(count):
+        T = T_map_lidar.copy()
+        T[:, 0, 3] += copy * APART_M
+        moved.append(T)
+        for number in range(len(T)):
+            os.link(scan_path(town.folder, number), scan_path(folder, copy * len(T) + number))
+    write_tum(
+        folder / "survey" / "poses.txt",
+        np.concatenate([stamps + copy * every_s for copy in range(count)]),
+        np.concatenate(moved),
+    )
+    return Dataset(folder)

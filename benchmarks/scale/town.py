@@ -72,20 +72,31 @@ def town_rows(report: Report, runs: Runs) -> None:
 
 
 def _build(report: Report, dataset: Dataset, out: Path) -> None:
-    """Build the map in another process, and watch time and memory of it and its children."""
+    minutes, peak = watched_build(dataset, out, "--name", "town", tile_m=TILE_M)
+    report.row("town.build_minutes", minutes, "min", bar=12, better="lower", n=len(dataset.survey_poses()))
+    report.row("town.build_peak_gib", peak / 2**30, "GiB", bar=2, better="lower")
+
+
+def watched_build(dataset: Dataset, out: Path, *options: str, tile_m: float) -> tuple[float, int]:
+    """Build a tiled map in another process. Return its time, minutes, and the peak memory of it and its children, bytes.
+
+    Args:
+        dataset: dataset to map.
+        out: folder of the map; it must not exist.
+        *options: further options of ``build-map``.
+        tile_m: edge of the tiles, metres.
+    """
     out.parent.mkdir(parents=True, exist_ok=True)
     command = [sys.executable, "-c", "from service.cli.start import main; main()", "build-map", str(dataset.folder)]
-    command += ["--out", str(out), "--name", "town", "--tile-m", f"{TILE_M:g}"]
+    command += ["--out", str(out), "--tile-m", f"{tile_m:g}", *options]
     began, peak = time.monotonic(), 0
     process = subprocess.Popen(command, cwd=ROOT)
     while process.poll() is None:
         peak = max(peak, memory_of_tree(process.pid))
         time.sleep(_LOOK_S)
     if process.returncode:
-        raise RuntimeError(f"the build of the town ended with code {process.returncode}")
-    minutes = (time.monotonic() - began) / 60
-    report.row("town.build_minutes", minutes, "min", bar=12, better="lower", n=len(dataset.survey_poses()))
-    report.row("town.build_peak_gib", peak / 2**30, "GiB", bar=2, better="lower")
+        raise RuntimeError(f"the build of {dataset.folder} ended with code {process.returncode}")
+    return (time.monotonic() - began) / 60, peak
 
 
 def memory_of_tree(pid: int) -> int:

@@ -10,7 +10,7 @@ A common offset of all scans is unobservable. A prior holds each scan near its g
 from collections.abc import Callable
 
 import numpy as np
-from jaxtyping import Float32, Float64
+from jaxtyping import Float32, Float64, Int16
 from numpy.typing import NDArray
 
 from model_training.datasets.dataset import Dataset
@@ -24,6 +24,8 @@ ROUNDS = 4
 #: Largest number of points of a scan, and their smallest and largest range. Nearer points lie on the vehicle. Farther points constrain
 #: the angles of the scan more than its position.
 POINTS, NEAREST_M, REACH_M = 3000, 2.5, 40.0
+#: Unit of the stored coordinates, metres. 16 bits take half the memory, and their rounding is a thirtieth of ``SIGMA_M``.
+_UNIT_M = REACH_M / 32767
 #: Edge of a voxel of the coarse map, metres.
 VOXEL_M = 0.4
 #: Noise of a LiDAR range, and roughness of surfaces; standard deviations in metres.
@@ -52,6 +54,8 @@ _TOGETHER = 64
 
 Poses = Float64[NDArray[np.float64], "N 4 4"]
 Points = Float32[NDArray[np.float32], "n 3"]
+#: Points in units of ``_UNIT_M``.
+Stored = Int16[NDArray[np.int16], "n 3"]
 #: Progress callback: stage, finished steps, all steps.
 Report = Callable[[str, int, int], None]
 
@@ -70,23 +74,31 @@ def aligned(dataset: Dataset, poses: Poses, kept: NDArray[np.int64], *, report: 
     steps = len(kept) * (1 + ROUNDS)
     scans = []
     for done, number in enumerate(kept):
-        scans.append(_thinned(dataset.scan(int(number))[:, :3], dataset.number_in_survey(int(number))))
+        thinned = _thinned(dataset.scan(int(number))[:, :3], dataset.number_in_survey(int(number)))
+        scans.append(np.rint(thinned / _UNIT_M).astype(np.int16))
         report("survey", done + 1, steps)
     now = poses[kept].copy()
     for done in range(ROUNDS):
-        voxels, shared = _map_of(scans, now)
-        surfels = voxels.surfels()
-        if not len(surfels.positions):
-            break
-        cloud = SurfelMap.prepare(voxels.origin, *voxels.tiles(surfels))
-        for k, points in enumerate(scans):
-            common = points[_are_of(voxels.keys_of(_placed(points, now[k])), shared)]
-            if len(common) >= FEWEST:
-                now[k] = _registered(cloud, common, now[k], poses[kept[k]])
-            report("survey", len(kept) * (1 + done) + k + 1, steps)
+        # A function, so that the map of a round is gone before the next one is built.
+        _align_once(scans, now, poses[kept], lambda k, done=done: report("survey", len(kept) * (1 + done) + k, steps))
     owner = np.clip(np.searchsorted(kept, np.arange(len(poses)), side="right") - 1, 0, len(kept) - 1)
     moved: Poses = (now @ np.linalg.inv(poses[kept]))[owner] @ poses
     return moved
+
+
+def _align_once(scans: list[Stored], now: Poses, given: Poses, report: Callable[[int], None]) -> None:
+    """Build the map of all scans and register each against it. The poses ``now`` change in place."""
+    voxels, shared = _map_of(scans, now)
+    surfels = voxels.surfels()
+    if not len(surfels.positions):
+        return
+    cloud = SurfelMap.prepare(voxels.origin, *voxels.tiles(surfels))
+    for k, stored in enumerate(scans):
+        points = _in_metres(stored)
+        common = points[_are_of(voxels.keys_of(_placed(points, now[k])), shared)]
+        if len(common) >= FEWEST:
+            now[k] = _registered(cloud, common, now[k], given[k])
+        report(k + 1)
 
 
 def _thinned(points: Points, number: int) -> Points:
@@ -104,24 +116,35 @@ def _thinned(points: Points, number: int) -> Points:
     return np.ascontiguousarray(points, np.float32)
 
 
+def _in_metres(stored: Stored) -> Points:
+    return stored * np.float32(_UNIT_M)
+
+
 def _placed(points: Points, T: NDArray[np.float64]) -> NDArray[np.float64]:
     return transform_points(T, points.astype(np.float64))
 
 
-def _map_of(scans: list[Points], poses: Poses) -> tuple[VoxelMap, NDArray[np.int64]]:
+def _map_of(scans: list[Stored], poses: Poses) -> tuple[VoxelMap, NDArray[np.int64]]:
     """Build the voxel map of all scans; return it with the sorted keys of the voxels that hold points of more than one scan.
 
     Only these voxels take part in registration. On a surface that no other scan has seen, a scan matches itself. There the rounding of
     the map would make its pose drift.
     """
     voxels = VoxelMap(VOXEL_M, lattice_origin(VOXEL_M, poses[:, :3, 3].mean(axis=0)))
-    each_once: list[NDArray[np.int64]] = []
+    keys, several = list[NDArray[np.int64]](), list[NDArray[np.bool_]]()
     for first in range(0, len(scans), _TOGETHER):
-        placed = [_placed(points, T) for points, T in zip(scans[first:][:_TOGETHER], poses[first:], strict=False)]
-        voxels.add(np.concatenate(placed))
-        each_once += [np.unique(voxels.keys_of(each)) for each in placed]
-    keys, times = np.unique(np.concatenate(each_once), return_counts=True)
-    return voxels, keys[times > 1]
+        some = zip(scans[first:][:_TOGETHER], poses[first:], strict=False)
+        placed = [_placed(_in_metres(stored), T) for stored, T in some]
+        points = np.concatenate(placed)
+        voxels.add(points)
+        of_points, scan = voxels.keys_of(points), np.repeat(np.arange(len(placed)), [len(each) for each in placed])
+        order = np.argsort(of_points, kind="stable")  # within a voxel in the order of the scans
+        found, start, count = np.unique(of_points[order], return_index=True, return_counts=True)
+        keys.append(found)
+        several.append(scan[order[start]] != scan[order[start + count - 1]])
+    found, times = np.unique(np.concatenate(keys), return_counts=True)
+    in_one_group = np.concatenate([each[are] for each, are in zip(keys, several, strict=True)])
+    return voxels, np.union1d(found[times > 1], in_one_group)
 
 
 def _are_of(keys: NDArray[np.int64], some: NDArray[np.int64]) -> NDArray[np.bool_]:

@@ -125,6 +125,7 @@ def write_from(
     # 4. The bundle.
     stages.report("writing", 0, 2)
     content = with_cloud(content, cloud)
+    del cloud  # the content has all that the bundle needs
     stages.report("writing", 1, 2)
     manifest = write_bundle(out, content, overwrite=overwrite)
     stages.report("writing", 2, 2)
@@ -227,7 +228,7 @@ def _checked(
 
     site = stages.site(calibration, check)
     for scan in scans:
-        cloud.add(*drive.cloud_points(scan))
+        cloud.add(*drive.cloud_points(scan.points, scan.T_map_level(drive.poses[scan.number])))
     return site
 
 

@@ -16,16 +16,16 @@ CLOUD_REACH_M = 40.0
 
 
 def near(
-    points: NDArray[np.float32], T_map_level: NDArray[np.float64]
+    points: NDArray[np.float32], T_map_points: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float32]]:
-    """Return the points of a levelled scan within ``CLOUD_REACH_M``: positions (m, 3), metres, map frame, and intensities (m,).
+    """Return the points of a scan within ``CLOUD_REACH_M``: positions (m, 3), metres, map frame, and intensities (m,).
 
     Args:
-        points: x, y, z (metres, level frame of the LiDAR) and intensity (n, 4).
-        T_map_level: pose of the levelled LiDAR (4, 4).
+        points: x, y, z (metres, frame of the LiDAR or its level frame) and intensity (n, 4).
+        T_map_points: pose of the frame of the points (4, 4).
     """
     reached = points[np.linalg.norm(points[:, :3], axis=1) < CLOUD_REACH_M]
-    return transform_points(T_map_level, reached[:, :3].astype(np.float64)), reached[:, 3]
+    return transform_points(T_map_points, reached[:, :3].astype(np.float64)), reached[:, 3]
 
 
 def prepared(cloud: VoxelMap, surfels: Surfels | None = None) -> SurfelMap | None:
@@ -48,9 +48,11 @@ def with_cloud(content: BundleContent, cloud: VoxelMap) -> BundleContent:
     """
     surfels = cloud.surfels()
     preview = preview_webp(surfels.positions, surfels.normals, content.T_map_place[:, :3, 3])
+    surfel_map = prepared(cloud, surfels)
+    del surfels  # they take as much memory as the sums that follow
     return replace(
         content,
-        cloud=prepared(cloud, surfels),
-        statistics=cloud.statistics() if len(surfels.positions) else None,
+        cloud=surfel_map,
+        statistics=None if surfel_map is None else cloud.statistics(),
         preview_webp=preview,
     )

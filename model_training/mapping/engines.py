@@ -19,14 +19,17 @@ from multiprocessing.process import BaseProcess
 from pathlib import Path
 from typing import Any, Literal, get_args
 
-from model_training.mapping.build_tile import TileTask, build_tile
+from model_training.mapping.build_tile import THREADS, TileTask, build_tile
 from service import errors
 from service.errors import BundleError, DatasetError, StreetfixError, extra_missing
+from service.heap import keep_little
 
 Engine = Literal["local", "ray"]
 ENGINES: tuple[Engine, ...] = get_args(Engine)
 #: Memory of a process that builds a tile: a part for the programs, and a part for each scan, bytes (decision 0161).
 PROCESS_BYTES, SCAN_BYTES = 300 << 20, 900 << 10
+#: Arrays of this size or more go back to the system as soon as they are free: scans are smaller, sums of voxels are larger.
+_MAPPED_BYTES = 2 << 20
 #: How often a tile is started before the build gives up, if the process that builds it dies: on this machine, and with Ray, whose
 #: machines may be taken away.
 LOCAL_ATTEMPTS, RAY_ATTEMPTS = 2, 4
@@ -122,6 +125,7 @@ def attempt(task: TileTask, told: Callable[[float], None]) -> Failure | None:
             last_s = time.monotonic()
             told(finished)
 
+    keep_little(THREADS, mapped_bytes=_MAPPED_BYTES)
     try:
         build_tile(task, share)
     except StreetfixError as error:

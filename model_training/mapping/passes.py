@@ -13,8 +13,13 @@ Passes are counted per tile of the ground. A tile that comes into reach again af
 within reach stays in the same pass. Votes are bits, one per pass, so their order does not matter.
 """
 
+import ctypes
 from collections.abc import Callable, Iterable
+from ctypes import c_int64, c_void_p
 from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,6 +30,7 @@ from model_training.mapping.survey import clear_scan, travelled_m
 from model_training.mapping.tiles import TilePart
 from model_training.mapping.voxel_map import VoxelMap
 from model_training.mapping.work import Arrays
+from service.compiled import load
 from service.geometry.rigid import inverse, transform_points
 
 #: Edge of a tile of the ground, metres.
@@ -36,14 +42,26 @@ AWAY_M = 30.0
 #: Largest number of a pass, counted from 0; later passes share it.
 MOST = 63
 
-#: Edge of a cell of the range image, degrees.
-_CELL_DEG = 0.5
-#: Size of the range image: elevations from -45 to 45 degrees, all azimuths.
+#: Library that the build compiles from ``sight.c``.
+LIBRARY = Path(__file__).with_name("_sight.so")
+#: Size of the range image, whose cells have half a degree: elevations from -45 to 45 degrees, all azimuths.
 _ROWS, _COLUMNS = 180, 720
 #: Points nearer than this lie on the vehicle, metres.
 _NEAREST_M = 2.0
 #: Number of tiles along an axis that have a number of their own.
 _SPAN = 1 << 24
+
+
+@cache
+def _library() -> ctypes.CDLL:
+    arguments: list[Any] = [
+        c_void_p, c_int64, c_void_p, c_void_p, c_void_p, c_int64,
+        c_void_p, c_void_p, c_void_p, c_void_p, c_void_p, c_void_p,
+    ]  # fmt: skip
+    library = load(LIBRARY, constants={"ROWS": _ROWS, "COLUMNS": _COLUMNS, "ARGUMENTS": len(arguments)})
+    library.streetfix_looked_through.argtypes = arguments
+    library.streetfix_looked_through.restype = c_int64
+    return library
 
 
 @dataclass(frozen=True, eq=False)
@@ -304,36 +322,23 @@ def looked_through(
         behind_m: smallest distance between the voxel and the end of a ray behind it, metres. One hundredth of the range is added for
             errors of poses and beams.
     """
-    if not len(points):  # a scan without returns sees through nothing
-        return candidates[:0]
-    ranges = np.linalg.norm(points, axis=1)
-    cells, on_grid = _cells(points, ranges)
-    order = np.flatnonzero(on_grid)
-    order = order[np.argsort(-ranges[order], kind="stable")]  # the nearest is written last and stays
-    point_at = np.full(_ROWS * _COLUMNS, -1)
-    point_at[cells[order]] = order
-    nearest = np.where(point_at >= 0, ranges[point_at], np.inf).reshape(_ROWS, _COLUMNS)
-    above = np.pad(nearest, ((1, 1), (0, 0)), constant_values=np.inf)
-    rows = np.minimum(np.minimum(above[:-2], above[1:-1]), above[2:])
-    around = np.minimum(np.minimum(np.roll(rows, 1, axis=1), rows), np.roll(rows, -1, axis=1)).ravel()
-    T_lidar_map = inverse(T_map_lidar)
-    position = transform_points(T_lidar_map, targets.positions[candidates])
-    away = np.linalg.norm(position, axis=1)
-    cell, visible = _cells(position, away)
-    visible &= (away <= REACH_M) & (point_at[cell] >= 0)
-    visible[visible] = around[cell[visible]] >= away[visible] * 1.01 + behind_m
-    candidates, position, end = candidates[visible], position[visible], points[point_at[cell[visible]]]
-    normal = targets.normals[candidates] @ T_lidar_map[:3, :3].T
-    off_plane = np.abs(((end - position) * normal).sum(axis=1)) > targets.voxel_m
-    return np.asarray(candidates[off_plane])
-
-
-def _cells(points: NDArray[np.float64], ranges: NDArray[np.float64]) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
-    """Return the cell of each point, 0 if it has none, and whether it has one."""
-    elevation = np.rad2deg(np.arcsin(np.clip(points[:, 2] / np.maximum(ranges, 1e-9), -1, 1)))
-    row = np.floor((elevation + 45.0) / _CELL_DEG).astype(np.int64)
-    column = (
-        np.floor((np.rad2deg(np.arctan2(points[:, 1], points[:, 0])) + 180.0) / _CELL_DEG).astype(np.int64) % _COLUMNS
+    points, candidates = (np.ascontiguousarray(array) for array in (points, candidates))
+    T_lidar_map = np.ascontiguousarray(inverse(T_map_lidar)[:3])
+    limits = np.array([_NEAREST_M, REACH_M, behind_m, targets.voxel_m])
+    point_at, ranges, least = np.empty(_ROWS * _COLUMNS, np.int32), *np.empty((2, _ROWS * _COLUMNS))
+    seen = np.empty(len(candidates), np.int64)
+    count = _library().streetfix_looked_through(
+        points.ctypes.data,
+        len(points),
+        targets.positions.ctypes.data,
+        targets.normals.ctypes.data,
+        candidates.ctypes.data,
+        len(candidates),
+        T_lidar_map.ctypes.data,
+        limits.ctypes.data,
+        point_at.ctypes.data,
+        least.ctypes.data,
+        ranges.ctypes.data,
+        seen.ctypes.data,
     )
-    inside = (row >= 0) & (row < _ROWS) & (ranges > _NEAREST_M)
-    return np.where(inside, row * _COLUMNS + column, 0), inside
+    return seen[:count]

@@ -12,7 +12,7 @@ from model_training.datasets.dataset import Dataset
 from model_training.mapping.between import PlacedScan, PlannedPlaces, Viewpoint, at_scan, viewpoint_at
 from model_training.mapping.cloud import near
 from model_training.mapping.settings import BuildSettings
-from model_training.mapping.survey import LevelledScan, fan, fan_views, levelled_scans
+from model_training.mapping.survey import clear_scan, fan, fan_views, levelled
 from model_training.mapping.tiles import TilePart
 from model_training.mapping.voxel_map import VoxelMap
 from model_training.mapping.work import Arrays
@@ -119,17 +119,23 @@ class Drive:
         points = VoxelMap(empty.voxel_m, empty.origin)
         found: list[Arrays] = []
         before: PlacedScan | None = None
-        start = max(scans.start - 1, 0)
-        for k, scan in enumerate(levelled_scans(self.dataset, self.kept[start : scans.stop], self.settings), start):
-            placed = PlacedScan(scan, scan.T_map_level(self.poses[scan.number]))
+        on_way = self.plan.on_way
+        for k in range(max(scans.start - 1, 0), scans.stop):
+            number = int(self.kept[k])
+            scan = clear_scan(self.dataset, number, self.settings)
+            # A scan that only gives points, like most around a tile, needs no level.
+            placed = None
+            if self.plan.at_scan[k] or k in on_way or k + 1 in on_way:
+                level = levelled(scan, number, self.settings)
+                placed = PlacedScan(level, level.T_map_level(self.poses[number]))
             if k in scans:
-                if before is not None:
-                    for share in self.plan.on_way.get(k, ()):
+                if placed is not None and before is not None:
+                    for share in on_way.get(k, ()):
                         found.append(self._encoded(viewpoint_at(before, placed, share), (k - 1, k)))
-                if self.plan.at_scan[k]:
+                if placed is not None and self.plan.at_scan[k]:
                     found.append(self._encoded(at_scan(placed), (k, k)))
                 if k not in apart:
-                    points.add(*self.cloud_points(scan))
+                    points.add(*self.cloud_points(scan, self.poses[number]))
                 report(k + 1)
             before = placed
         keys, moments = points.sums()
@@ -138,13 +144,16 @@ class Drive:
         )
         return fields | {"keys": keys, "moments": moments}
 
-    def cloud_points(self, scan: LevelledScan) -> tuple[NDArray[np.float64], NDArray[np.float32]]:
+    def cloud_points(
+        self, points: NDArray[np.float32], T_map_points: NDArray[np.float64]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float32]]:
         """Return the points of a scan that go into the cloud: positions (m, 3), metres, map frame, and intensities (m,).
 
         Args:
-            scan: a scan of this traversal.
+            points: x, y, z (metres, frame of the LiDAR or its level frame) and intensity (n, 4).
+            T_map_points: pose of the frame of the points (4, 4).
         """
-        positions, intensity = near(scan.points, scan.T_map_level(self.poses[scan.number]))
+        positions, intensity = near(points, T_map_points)
         if self.part is None:
             return positions, intensity
         inside = self.part.is_in_cloud(positions)
@@ -180,6 +189,17 @@ class Drive:
         }
 
 
+def _joined(parts: list[NDArray[Any]], row: NDArray[np.int64]) -> NDArray[Any]:
+    """Join arrays in another order: the rows of ``row`` (n,). The list becomes empty, so the memory of a part is free when it is copied."""
+    whole, done = np.empty((len(row), *parts[0].shape[1:]), parts[0].dtype), 0
+    parts.reverse()
+    while parts:
+        part = parts.pop()
+        whole[row[done : done + len(part)]] = part
+        done += len(part)
+    return whole
+
+
 def gathered(chunks: Iterable[Arrays], empty: VoxelMap) -> tuple[Places, VoxelMap]:
     """Put the chunks of a traversal together: its places, and the voxel map of its points.
 
@@ -191,9 +211,10 @@ def gathered(chunks: Iterable[Arrays], empty: VoxelMap) -> tuple[Places, VoxelMa
     for chunk in chunks:
         cloud.add_sums(chunk["keys"], chunk["moments"])
         fields.append({name: chunk[name] for name in Places.__slots__})
-    whole = {name: np.concatenate([each[name] for each in fields]) for name in Places.__slots__}
-    order = np.argsort(whole["sources"][:, 0] != whole["sources"][:, 1], kind="stable")  # those at scans first
-    whole = {name: field[order] for name, field in whole.items()}
+    sources = np.concatenate([each["sources"] for each in fields])
+    row = np.empty(len(sources), np.int64)
+    row[np.argsort(sources[:, 0] != sources[:, 1], kind="stable")] = np.arange(len(sources))  # those at scans first
+    whole = {name: _joined([each.pop(name) for each in fields], row) for name in Places.__slots__}
     descriptors = whole.pop("descriptors")
     return Places(**whole, descriptors=descriptors.reshape(-1, descriptors.shape[-1])), cloud
 

@@ -154,10 +154,20 @@ def levelled_scans(dataset: Dataset, numbers: NDArray[np.int64], settings: Build
         settings: settings of the map: the expected LiDAR height, and whether weather is removed.
     """
     for number in numbers:
-        points = clear_scan(dataset, int(number), settings)
-        level = level_scan(points[:, :3], expected_height_m=settings.expected_lidar_height_m)
-        levelled = np.c_[points[:, :3] @ level.R_level_sensor.T.astype(np.float32), points[:, 3]]
-        yield LevelledScan(int(number), levelled, level, principal_heading(levelled[:, :3], height_m=level.height_m))
+        yield levelled(clear_scan(dataset, int(number), settings), int(number), settings)
+
+
+def levelled(points: NDArray[np.float32], number: int, settings: BuildSettings) -> LevelledScan:
+    """Level a scan by PCA, and find its principal heading.
+
+    Args:
+        points: x, y, z (metres, LiDAR frame) and intensity (n, 4).
+        number: index of the scan.
+        settings: settings of the map: the expected LiDAR height.
+    """
+    level = level_scan(points[:, :3], expected_height_m=settings.expected_lidar_height_m)
+    turned = np.c_[points[:, :3] @ level.R_level_sensor.T.astype(np.float32), points[:, 3]]
+    return LevelledScan(number, turned, level, principal_heading(turned[:, :3], height_m=level.height_m))
 
 
 def clear_scan(dataset: Dataset, number: int, settings: BuildSettings) -> NDArray[np.float32]:

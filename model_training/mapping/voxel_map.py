@@ -1,21 +1,28 @@
 """Accumulate scans in voxels and compute the surfels of the map cloud.
 
-Each voxel stores the moments of its points: count, sum, sum of products. So the memory depends on the number of voxels, not of points.
+Each voxel stores the moments of its points: count, sum, sum of products, in single precision as in a bundle. So the memory depends on the
+number of voxels, not of points: 56 bytes each, and twice as much while scans are added.
 The normal of a voxel is the axis of least variance of its moments and those of its 26 neighbours. The neighbours have less weight.
 """
 
+import ctypes
 from collections.abc import Callable
+from ctypes import c_double, c_int64, c_void_p
 from dataclasses import dataclass
-from itertools import product
-from typing import Any
+from functools import cache
+from pathlib import Path
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
+from service.compiled import load
 from service.errors import DatasetError
 from service.registration.kernel import SURFEL
 from service.registration.surfel_map import TILE_M
 
+#: Library that the build compiles from ``surfels.c``.
+LIBRARY = Path(__file__).with_name("_surfels.so")
 #: Number of cells along an axis. A key has 3 x 20 bits.
 _SPAN = 1 << 20
 #: Largest distance of a cell from the origin, in cells, up to which it and its neighbours have unique keys.
@@ -28,7 +35,8 @@ _MOMENTS, _BRIGHT = 12, slice(10, 12)
 #: recesses of a facade into one slope. Smaller weights (0.1, 0.02, 0.005) follow the noise of the survey (decision 0098).
 _NEIGHBOUR = (1.0, 0.3, 0.1, 0.03)
 #: Smallest number of waiting rows of sums that starts a merge.
-_WAITING = 1 << 20
+_WAITING = 1 << 19
+_Float = TypeVar("_Float", np.float32, np.float64)
 
 #: A voxel as a bundle stores it, for merging maps. ``cell``: its cell; all maps of one edge share one lattice through the zero of the map
 #: frame. ``points``: number of points. ``sums``: their sums (m) and sums of products (m2) about the voxel's centre.
@@ -36,6 +44,15 @@ _WAITING = 1 << 20
 VOXEL = np.dtype(
     [("cell", "<i4", (3,)), ("points", "<u4"), ("sums", "<f4", (9,)), ("brightness", "<f4"), ("bright_points", "<u4")]
 )
+
+
+@cache
+def _library() -> ctypes.CDLL:
+    arguments: list[Any] = [c_void_p, c_void_p, c_int64, c_double, c_void_p, c_double, c_void_p, c_void_p, c_void_p]
+    library = load(LIBRARY, constants={"MOMENTS": _MOMENTS, "SPAN": _SPAN, "ARGUMENTS": len(arguments)})
+    library.streetfix_surfels.argtypes = arguments
+    library.streetfix_surfels.restype = None
+    return library
 
 
 @dataclass(frozen=True)
@@ -74,8 +91,8 @@ class VoxelMap:
     def __init__(self, voxel_m: float, origin: NDArray[np.float64]) -> None:
         self.voxel_m, self.origin = voxel_m, origin
         self._keys = np.zeros(0, np.int64)
-        self._moments = np.zeros((0, _MOMENTS))
-        self._waiting: list[tuple[NDArray[np.int64], NDArray[np.float64]]] = []
+        self._moments = np.zeros((0, _MOMENTS), np.float32)
+        self._waiting: list[tuple[NDArray[np.int64], NDArray[np.float32]]] = []
 
     @property
     def reach_m(self) -> float:
@@ -115,26 +132,41 @@ class VoxelMap:
         """
         cell = self._cells(points_map)
         local = (points_map - self.origin) - (cell + 0.5) * self.voxel_m
-        moments = _moments_of(local)
-        if intensity is not None:
-            moments[:, _BRIGHT] = np.stack([intensity, np.ones(len(intensity))], axis=1)
-        self.add_sums(*_summed(_keys_of_cells(cell), moments))
+        # Sorted before the products: a point has three numbers, its moments have twelve.
+        keys = _keys_of_cells(cell)
+        order = np.argsort(keys, kind="stable")
+        keys = keys[order]
+        first = _first_of_each(keys)
+        moments = np.zeros((len(first), _MOMENTS), np.float32)
+        if len(first):
+            for column, values in enumerate(_moments_of(local[order]).T[: _BRIGHT.start]):
+                moments[:, column] = np.add.reduceat(values, first)
+            if intensity is not None:
+                moments[:, _BRIGHT.start] = np.add.reduceat(intensity[order].astype(np.float64), first)
+                moments[:, _BRIGHT.start + 1] = moments[:, 0]
+        self._add(keys[first], moments)
 
-    def add_sums(self, keys: NDArray[np.int64], moments: NDArray[np.float64]) -> None:
+    def add_sums(self, keys: NDArray[np.int64], moments: NDArray[np.floating[Any]]) -> None:
         """Add the ``sums`` of another map with the same voxel edge and the same origin.
 
         Args:
             keys: keys of the voxels (n,).
-            moments: moments of the voxels (n, 12).
+            moments: moments of the voxels (n, 12). They are copied.
         """
-        self._waiting.append((keys, moments))
+        self._add(keys, np.array(moments, np.float32))
+
+    def _add(self, keys: NDArray[np.int64], moments: NDArray[np.floating[Any]]) -> None:
+        self._waiting.append((keys, np.ascontiguousarray(moments, np.float32)))
         # The limit grows with the map, so even a large map is seldom copied. It depends on the added rows only, so the same calls give
         # the same rounding.
         if sum(len(k) for k, _ in self._waiting) >= max(_WAITING, len(self._keys) // 4):
             self._merge()
 
-    def sums(self) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-        """Return the keys of all voxels, ascending (n,), and their moments about the voxel's centre (n, 12)."""
+    def sums(self) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
+        """Return the keys of all voxels, ascending (n,), and their moments about the voxel's centre (n, 12).
+
+        The moments are those of the map itself, so they change if points are added.
+        """
         self._merge()
         return self._keys, self._moments
 
@@ -160,14 +192,14 @@ class VoxelMap:
 
     def means(self) -> NDArray[np.float64]:
         """Return the mean of each voxel's points (n, 3), metres, map frame, in the order of ``sums``."""
-        keys, moments = self.sums()
-        return self.origin + (_cells_of_keys(keys) + 0.5) * self.voxel_m + moments[:, 1:4] / moments[:, :1]
+        return self._means_of(*self.sums())
 
     def statistics(self) -> NDArray[Any]:
         """Return all voxels in the format of a bundle: (n,) of ``VOXEL``. The origin must come from ``lattice_origin``."""
         keys, moments = self.sums()
         found = np.zeros(len(keys), VOXEL)
-        found["cell"] = _cells_of_keys(keys) + self._lattice()
+        for axis, corner in enumerate(self._lattice()):
+            found["cell"][:, axis] = _axis_of_keys(keys, axis) + corner
         found["points"], found["sums"] = moments[:, 0], moments[:, 1 : _BRIGHT.start]
         found["brightness"], found["bright_points"] = moments[:, _BRIGHT].T
         return found
@@ -186,10 +218,10 @@ class VoxelMap:
         cell = statistics["cell"].astype(np.int64) - self._lattice()
         self.require_within(self.origin + cell * self.voxel_m, lambda _: "a voxel of the added map")
         keys = _keys_of_cells(cell)
-        moments = np.zeros((len(keys), _MOMENTS))
+        moments = np.zeros((len(keys), _MOMENTS), np.float32)
         moments[:, 0], moments[:, 1 : _BRIGHT.start] = statistics["points"], statistics["sums"]
         moments[:, _BRIGHT] = np.stack([statistics["brightness"], statistics["bright_points"]], axis=1)
-        self.add_sums(*_summed(keys, moments))
+        self._add(*_summed(keys, moments))
 
     def add_moments(self, means: NDArray[np.float64], points: NDArray[Any], covariances: NDArray[np.float64]) -> None:
         """Add groups of points by their moments. A group goes into the voxel of its mean.
@@ -205,7 +237,7 @@ class VoxelMap:
         cell = self._cells(means)
         moments = _moments_of((means - self.origin) - (cell + 0.5) * self.voxel_m)
         moments[:, _SECOND] += covariances[:, [0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]]
-        self.add_sums(*_summed(_keys_of_cells(cell), moments * points.astype(np.float64)[:, None]))
+        self._add(*_summed(_keys_of_cells(cell), moments * points.astype(np.float64)[:, None]))
 
     def _cells(self, points_map: NDArray[np.float64]) -> NDArray[np.int64]:
         cell = np.floor((points_map - self.origin) / self.voxel_m)
@@ -220,10 +252,21 @@ class VoxelMap:
     def _merge(self) -> None:
         if not self._waiting:
             return
-        keys = np.concatenate([self._keys, *(k for k, _ in self._waiting)])
-        moments = np.concatenate([self._moments, *(m for _, m in self._waiting)])
-        self._keys, self._moments = _summed(keys, moments)
+        added, moments = _summed(*(np.concatenate(each) for each in zip(*self._waiting, strict=True)))
         self._waiting = []
+        at = np.searchsorted(self._keys, added)
+        known = at < len(self._keys)
+        known[known] = self._keys[at[known]] == added[known]
+        self._moments[at[known]] += moments[known]
+        fresh = at[~known] + np.arange(len(added) - int(known.sum()))  # where the new voxels go, in ascending order
+        if not len(fresh):
+            return
+        old = np.ones(len(self._keys) + len(fresh), np.bool_)
+        old[fresh] = False
+        keys, sums = np.empty(len(old), np.int64), np.empty((len(old), _MOMENTS), np.float32)
+        keys[old], keys[fresh] = self._keys, added[~known]
+        sums[old], sums[fresh] = self._moments, moments[~known]
+        self._keys, self._moments = keys, sums
 
     def surfels(self, *, fewest: int = 5) -> "Surfels":
         """Compute one surfel for each voxel with enough points for a normal.
@@ -232,27 +275,34 @@ class VoxelMap:
             fewest: smallest number of points in the voxel and its 26 neighbours together.
         """
         self._merge()
-        keys, own = self._keys, self._moments
-        total, around = np.zeros_like(own), np.zeros(len(own))
-        for dx, dy, dz in product((-1, 0, 1), repeat=3):
-            wanted = keys + ((dx * _SPAN) + dy) * _SPAN + dz
-            at = np.searchsorted(keys, wanted)
-            at[at == len(keys)] = 0
-            found = keys[at] == wanted
-            weight = _NEIGHBOUR[abs(dx) + abs(dy) + abs(dz)]
-            total[found] += weight * _shifted(own[at[found]], np.array([dx, dy, dz]) * self.voxel_m)
-            around[found] += own[at[found], 0]
-        keep = around >= fewest
-        keys, own, total = keys[keep], own[keep], total[keep]
-        centre = self.origin + (_cells_of_keys(keys) + 0.5) * self.voxel_m
-        variances, axes = np.linalg.eigh(_covariances(total))
-        normals = axes[:, :, 0].astype(np.float32)
-        thickness = np.sqrt(np.maximum(variances[:, 0], 0)).astype(np.float32)
-        bright, told = own[:, _BRIGHT].T
-        brightness = np.divide(bright, told, out=np.full(len(own), np.nan), where=told > 0).astype(np.float32)
-        return Surfels(
-            centre + own[:, 1:4] / own[:, :1], normals, thickness, own[:, 0].astype(np.uint32), keys, brightness
+        count = len(self._keys)
+        around, normals, thickness = np.empty(count), np.empty((count, 3), np.float32), np.empty(count, np.float32)
+        weights = np.array(_NEIGHBOUR)
+        _library().streetfix_surfels(
+            self._keys.ctypes.data,
+            self._moments.ctypes.data,
+            count,
+            self.voxel_m,
+            weights.ctypes.data,
+            fewest,
+            around.ctypes.data,
+            normals.ctypes.data,
+            thickness.ctypes.data,
         )
+        keep = around >= fewest
+        keys, own = self._keys[keep], self._moments[keep]
+        bright, told = own[:, _BRIGHT].T
+        brightness = np.divide(bright, told, out=np.full(len(own), np.nan, np.float32), where=told > 0)
+        points = own[:, 0].astype(np.uint32)
+        return Surfels(self._means_of(keys, own), normals[keep], thickness[keep], points, keys, brightness)
+
+    def _means_of(self, keys: NDArray[np.int64], moments: NDArray[np.float32]) -> NDArray[np.float64]:
+        """Return the mean of the points of some voxels (n, 3), metres, map frame."""
+        means = np.empty((len(keys), 3))
+        for axis in range(3):
+            centre = self.origin[axis] + (_axis_of_keys(keys, axis) + 0.5) * self.voxel_m
+            means[:, axis] = centre + moments[:, 1 + axis] / moments[:, 0].astype(np.float64)
+        return means
 
     def tiles(self, found: "Surfels") -> tuple[NDArray[Any], NDArray[np.float64], NDArray[np.float32]]:
         """Sort surfels by tile, in the format of ``SurfelMap.prepare``.
@@ -266,14 +316,21 @@ class VoxelMap:
             Surfels (n,) of ``SURFEL`` with positions relative to ``origin``; tiles (T, 4): centre x, y (metres, same frame), first surfel
             and number of surfels; brightness of each surfel (n,).
         """
-        positions = found.positions - self.origin
-        tile = np.floor(positions[:, :2] / TILE_M).astype(np.int64)
-        order = np.lexsort((tile[:, 1], tile[:, 0]))
-        corners, first, count = np.unique(tile[order], axis=0, return_index=True, return_counts=True)
-        surfels = np.zeros(len(positions), SURFEL)
-        surfels["xyz"] = positions[order]
+        # Axis by axis: a map of five million surfels fits into memory only without copies of all positions.
+        x, y = (np.floor((found.positions[:, axis] - self.origin[axis]) / TILE_M).astype(np.int64) for axis in (0, 1))
+        tile = x * _SPAN + y  # both are far below _SPAN / 2
+        del x, y
+        order = np.argsort(tile, kind="stable")
+        tile = tile[order]
+        first = _first_of_each(tile)
+        column = np.rint(tile[first] / _SPAN)
+        corners = np.stack([column, tile[first] - column * _SPAN], axis=1)
+        surfels = np.zeros(len(order), SURFEL)
+        for axis in range(3):
+            surfels["xyz"][:, axis] = (found.positions[:, axis] - self.origin[axis])[order]
         surfels["normal"], surfels["thickness_m"] = found.normals[order], found.thickness_m[order]
         surfels["points"] = found.points[order]
+        count = np.diff(np.r_[first, len(order)])
         return surfels, np.c_[(corners + 0.5) * TILE_M, first, count], found.brightness[order]
 
 
@@ -292,50 +349,26 @@ def _keys_of_cells(cell: NDArray[np.int64]) -> NDArray[np.int64]:
     return np.asarray((shifted[:, 0] * _SPAN + shifted[:, 1]) * _SPAN + shifted[:, 2])
 
 
-def _cells_of_keys(keys: NDArray[np.int64]) -> NDArray[np.int64]:
-    return np.stack([keys // (_SPAN * _SPAN), keys // _SPAN % _SPAN, keys % _SPAN], axis=1) - _SPAN // 2
+def _axis_of_keys(keys: NDArray[np.int64], axis: int) -> NDArray[np.int64]:
+    """Return the cell of each key along an axis (n,)."""
+    return np.asarray(keys // _SPAN ** (2 - axis) % _SPAN - _SPAN // 2)
 
 
 def _moments_of(local: NDArray[np.float64]) -> NDArray[np.float64]:
     x, y, z = local.T
     unknown = np.zeros(len(x))
-    return np.stack([np.ones(len(x)), x, y, z, x * x, x * y, x * z, y * y, y * z, z * z, unknown, unknown], axis=1)
+    # Row by row in memory: sums read one moment of all points after the other.
+    return np.array([np.ones(len(x)), x, y, z, x * x, x * y, x * z, y * y, y * z, z * z, unknown, unknown]).T
 
 
-def _summed(keys: NDArray[np.int64], moments: NDArray[np.float64]) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+def _summed(keys: NDArray[np.int64], moments: NDArray[_Float]) -> tuple[NDArray[np.int64], NDArray[_Float]]:
     """Add up the rows of equal key; the keys become ascending."""
     order = np.argsort(keys, kind="stable")
     keys, moments = keys[order], moments[order]
-    first = np.flatnonzero(np.r_[True, keys[1:] != keys[:-1]]) if len(keys) else np.zeros(0, np.int64)
+    first = _first_of_each(keys)
     return keys[first], np.add.reduceat(moments, first, axis=0) if len(first) else moments
 
 
-def _shifted(moments: NDArray[np.float64], shift: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the moments after every point has moved by ``shift`` (3,)."""
-    n, s = moments[:, :1], moments[:, 1:4]
-    a, b, c = shift
-    moved = moments.copy()
-    moved[:, 1:4] += n * shift
-    x, y, z = s.T
-    n0 = moments[:, 0]
-    moved[:, _SECOND] += np.stack(
-        [
-            2 * a * x + n0 * a * a,
-            a * y + b * x + n0 * a * b,
-            a * z + c * x + n0 * a * c,
-            2 * b * y + n0 * b * b,
-            b * z + c * y + n0 * b * c,
-            2 * c * z + n0 * c * c,
-        ],
-        axis=1,
-    )
-    return moved
-
-
-def _covariances(moments: NDArray[np.float64]) -> NDArray[np.float64]:
-    n = moments[:, :1]
-    mean = moments[:, 1:4] / n
-    second = moments[:, _SECOND] / n
-    index = np.array([[0, 1, 2], [1, 3, 4], [2, 4, 5]])
-    covariances: NDArray[np.float64] = second[:, index] - mean[:, :, None] * mean[:, None, :]
-    return covariances
+def _first_of_each(keys: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Return the position of the first of each run of equal keys (n,)."""
+    return np.flatnonzero(np.r_[True, keys[1:] != keys[:-1]]) if len(keys) else np.zeros(0, np.int64)

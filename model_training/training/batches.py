@@ -1,4 +1,8 @@
-"""Draw batches of pairs of one city. The caller may choose some pairs, to get hard negatives."""
+"""Draw batches of pairs of one city. The caller may choose some pairs, to get hard negatives.
+
+A GPU holds whole packs in its memory. Views that a CPU cuts out and copies to it take seven times as long as a training step
+(decision 0166).
+"""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,13 +17,14 @@ from model_training.training.packs import Pack
 from service.errors import DatasetError
 from service.imaging.view_grid import ViewGrid
 
+_CPU = torch.device("cpu")
 #: Greatest distance of a query from the place that it is paired with, metres.
 PAIR_REACH_M = 2.5
 
 
 @dataclass(frozen=True)
 class Batch:
-    """Clean views of B pairs.
+    """Clean views of B pairs. Views and heights are on the device of the city.
 
     Attributes:
         survey_ranges: (B, rows, columns), metres.
@@ -89,7 +94,9 @@ class Choice:
         return _tensor(self.places[:, :2])
 
 
-def open_cities(folders: list[Path], grid: ViewGrid, *, turn_deg: float, pairs: int) -> "list[City]":
+def open_cities(
+    folders: list[Path], grid: ViewGrid, *, turn_deg: float, pairs: int, device: torch.device = _CPU
+) -> "list[City]":
     """Open packs. Each pack must fill a batch.
 
     Args:
@@ -97,13 +104,21 @@ def open_cities(folders: list[Path], grid: ViewGrid, *, turn_deg: float, pairs: 
         grid: the view grid.
         turn_deg: greatest rotation between a query and its map view, degrees.
         pairs: pairs per batch.
+        device: device that holds the packs. On a CPU they stay in their files.
 
     Raises:
-        DatasetError: a pack is damaged, or has too few queries near a place.
+        DatasetError: a pack is damaged, has too few queries near a place, or does not fit into the memory of the device.
     """
-    cities = []
+    cities: list[City] = []
     for folder in folders:
-        city = City(Pack.open(folder), grid, turn_deg=turn_deg)
+        try:
+            city = City(Pack.open(folder), grid, turn_deg=turn_deg, device=device)
+        except torch.OutOfMemoryError as error:
+            raise DatasetError(
+                f"device: the memory of {device} is full after {len(cities)} of {len(folders)} cities; train with fewer --cities, or with "
+                "--device cpu",
+                field="device",
+            ) from error
         if len(city.usable) < pairs:
             raise DatasetError(
                 f"{folder}: {len(city.usable)} of its {len(city.pack.queries)} queries lie within {PAIR_REACH_M:g} m "
@@ -122,10 +137,16 @@ class City:
         pack: the city's views.
         grid: the view grid.
         turn_deg: greatest rotation between a query and its map view, degrees.
+        device: device that holds the views.
     """
 
-    def __init__(self, pack: Pack, grid: ViewGrid, *, turn_deg: float) -> None:
-        self.pack, self._grid, self._turn_rad = pack, grid, np.deg2rad(turn_deg)
+    def __init__(self, pack: Pack, grid: ViewGrid, *, turn_deg: float, device: torch.device = _CPU) -> None:
+        self.pack, self._grid, self._turn_rad, self._device = pack, grid, np.deg2rad(turn_deg), device
+        self._panoramas, self._intensities, self._ranges, self._rgb, self._rows_seen = (
+            torch.from_numpy(array).to(device)
+            for array in (pack.panoramas, pack.intensities, pack.ranges, pack.rgb, pack.rows_seen)
+        )
+        self._seen = None if pack.seen is None else torch.from_numpy(pack.seen).to(device)
         places = cKDTree(pack.places[:, :2])
         self._places_near = places.query_ball_point(pack.queries[:, :2], PAIR_REACH_M)
         self.usable = np.array([k for k, near in enumerate(self._places_near) if near])
@@ -161,30 +182,28 @@ class City:
         Args:
             choice: B pairs of this city.
         """
-        pack, grid = self.pack, self._grid
-        chosen, queries, places = choice.pairs, choice.queries, choice.places
+        grid, queries, places = self._grid, choice.queries, choice.places
         heading = queries[:, 2] + choice.turn_rad - places[:, 2]
-        columns = (
-            np.rint((heading[:, None] + grid.azimuths_rad + np.pi) / (2 * np.pi) * grid.around).astype(int)
-            % grid.around
-        )
-
-        def views(panoramas: NDArray[np.generic]) -> NDArray[np.generic]:
-            return np.stack([panoramas[p][:, c] for p, c in zip(choice.place, columns, strict=True)])
-
+        turned = np.rint((heading[:, None] + grid.azimuths_rad + np.pi) / (2 * np.pi) * grid.around)
+        columns = self._on_device(turned.astype(np.int64) % grid.around)[:, None, :]
+        pairs, place = self._on_device(choice.pairs), self._on_device(choice.place)[:, None, None]
+        rows = torch.arange(grid.rows, device=self._device)[None, :, None]
         return Batch(
-            _tensor(views(pack.panoramas)),
-            (_tensor(views(pack.intensities)) / 255) ** 2,
-            _tensor(places[:, 3]),
-            _tensor(pack.ranges[chosen]),
-            _tensor(pack.rgb[chosen].transpose(0, 3, 1, 2)),
-            _tensor(queries[:, 3]),
-            torch.from_numpy(np.array(pack.rows_seen)),
+            self._panoramas[place, rows, columns].float(),
+            (self._intensities[place, rows, columns].float() / 255) ** 2,
+            self._on_device(places[:, 3]).float(),
+            self._ranges[pairs].float(),
+            self._rgb[pairs].permute(0, 3, 1, 2).float().contiguous(),
+            self._on_device(queries[:, 3]).float(),
+            self._rows_seen,
             choice.survey_xy,
             choice.query_xy,
-            chosen,
-            None if pack.seen is None else torch.from_numpy(np.ascontiguousarray(pack.seen[chosen])),
+            choice.pairs,
+            None if self._seen is None else self._seen[pairs],
         )
+
+    def _on_device(self, array: NDArray[np.generic]) -> Tensor:
+        return torch.from_numpy(np.ascontiguousarray(array)).to(self._device)
 
 
 def _tensor(array: NDArray[np.generic]) -> Tensor:

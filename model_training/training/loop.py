@@ -179,7 +179,7 @@ def train(
     generator = torch.Generator(device=place).manual_seed(config.seed)
     augment = Augmenter(config.augmentation, grid, generator, place)
     checkpoint = run / "checkpoint.pt"
-    cities = open_cities(packs, grid, turn_deg=config.turn_deg, pairs=config.pairs)
+    cities = open_cities(packs, grid, turn_deg=config.turn_deg, pairs=config.pairs, device=place)
     log_scale = torch.nn.Parameter(torch.tensor(float(np.log(1 / 0.07)), device=place))
     net = EncoderNet(config.encoder)
     if start_from is not None and not start_from.is_dir() and not (resume and checkpoint.exists()):

@@ -117,7 +117,7 @@ class Pack:
         matched = MATCHED in folder.name
         return Pack(
             **{
-                name: read_arrays(path, partial(np.load, path, mmap_mode="r", allow_pickle=False), remedy=remedy)
+                name: read_arrays(path, partial(np.load, path, mmap_mode="c", allow_pickle=False), remedy=remedy)
                 for name, path in ((name, folder / f"{name}.npy") for name in Pack.__annotations__)
                 if name != "seen" or matched
             }

@@ -180,7 +180,7 @@ def serve(settings: "Settings") -> None:
     """
     from pydantic import SecretStr
 
-    from service.runtime.heap import keep_little
+    from service.heap import keep_little
     from service.runtime.seal import LEAST_KEY
     from service.runtime.threads import usable_cores
 

@@ -25,7 +25,10 @@ def write_records(path: Path, records: NDArray[Any]) -> None:
         records: records of any structured type (n,).
     """
     rows = np.ascontiguousarray(records).view(np.uint8).reshape(len(records), records.dtype.itemsize)
-    path.write_bytes(zstandard.ZstdCompressor(level=_LEVEL).compress(np.ascontiguousarray(rows.T).data))
+    # Plane by plane, so that the memory does not hold all planes beside the records.
+    with path.open("wb") as file, zstandard.ZstdCompressor(level=_LEVEL).stream_writer(file, size=rows.size) as writer:
+        for plane in rows.T:
+            writer.write(np.ascontiguousarray(plane).data)
 
 
 def read_records(path: Path, dtype: np.dtype[Any]) -> NDArray[Any]:

@@ -14,7 +14,7 @@ from types import TracebackType
 from typing import Any, Self, TypeVar
 
 from service.errors import BusyError, TooLargeError
-from service.runtime.heap import LARGE_BYTES, Trimmer
+from service.heap import LARGE_BYTES, Trimmer
 
 T = TypeVar("T")
 

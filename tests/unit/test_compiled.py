@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 import service
+from model_training.mapping import passes, voxel_map
 from service.compiled import compiled_layout, declared_layout, load
 from service.errors import StreetfixError
 from service.imaging import depth16, level, resample
@@ -28,6 +29,8 @@ LIBRARIES = (resample.LIBRARY, level.LIBRARY, kernel.LIBRARY, points.LIBRARY, vi
         visibility._library,
         rays._library,
         depth16.library,
+        voxel_map._library,
+        passes._library,
     ],
 )
 def test_the_compiled_layout_fits_the_python_declarations(loaded):

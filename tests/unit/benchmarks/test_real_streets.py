@@ -5,14 +5,40 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from benchmarks.real.confidence import CalibrationErrors, pooled_confidence_rows
+from benchmarks.real.confidence import (
+    CalibrationErrors,
+    calibrated_elsewhere_rows,
+    pooled_confidence_rows,
+    with_correction,
+)
 from benchmarks.real.peers import pooled_rows
 from benchmarks.real.streets import answer_rows, status_rows
 from benchmarks.real.variants import PRIOR_M, EveryScan, grey, prior_at
 from benchmarks.report import Report
 from model_training.datasets.dataset import Dataset
 from service.geometry.camera import PinholeCamera
+from service.localization.localizer import Localizer
+from service.maps.calibration import RigCorrection
+from service.maps.reader import MapBundle
 from service.retrieval.query import Query
+
+CORRECTION = RigCorrection(
+    scale=1.5,
+    offset=-0.5,
+    lower_only=False,
+    source="drive",
+    measured_on="a drive",
+    frames=10,
+    right=8,
+    outside=5,
+    error_before=0.1,
+    error_after=0.05,
+    accepted=5,
+    accepted_wrong=0,
+    wrong_share_upper=0.5,
+    outside_accepted=0,
+    outside_share_upper=0.5,
+)
 
 
 def rows_of(report):
@@ -94,7 +120,9 @@ def test_drives_are_pooled_by_their_queries_and_ours_must_be_higher(tmp_path):
 
 def test_calibration_errors_are_pooled_by_the_queries_of_each_drive(tmp_path):
     report = Report("x", "x", folder=tmp_path)
-    pooled_confidence_rows(report, [CalibrationErrors(10, 0.2, 0.1), CalibrationErrors(30, 0.04, 0.02)])
+    pooled_confidence_rows(
+        report, [CalibrationErrors(10, 0.2, 0.1, CORRECTION), CalibrationErrors(30, 0.04, 0.02, CORRECTION)]
+    )
     rows = rows_of(report)
     assert rows["real.ece"]["value"] == pytest.approx(0.08)
     assert rows["real.ece"]["n"] == 40
@@ -106,3 +134,26 @@ def test_without_a_drive_there_are_no_calibration_errors(tmp_path):
     report = Report("x", "x", folder=tmp_path)
     pooled_confidence_rows(report, [])
     assert report.rows == []
+
+
+def test_the_correction_of_another_drive_changes_the_confidence(stock_map, small_dataset):
+    """The corrected log odds are 1.5 times the log odds, less 0.5."""
+    localizer = Localizer.open(MapBundle.open(stock_map))
+    query = next(iter(small_dataset.queries("drive1_precise"))).query(localizer.bundle.grid)
+    before, after = (each.localize(query).confidence for each in (localizer, with_correction(localizer, CORRECTION)))
+    odds = np.log(before / (1 - before))
+    assert np.log(after / (1 - after)) == pytest.approx(1.5 * odds - 0.5, abs=1e-6)
+    assert localizer.bundle.calibration.rig is None
+
+
+def test_rows_with_the_correction_of_another_drive(tmp_path, answers_of):
+    """Of three accepted answers one is 3 m off. One of five queries is right and refused."""
+    report = Report("x", "x", folder=tmp_path)
+    status = ["LOCALIZED"] * 3 + ["AMBIGUOUS"] * 2
+    found = answers_of([[0, 0]] * 5, [[0.1, 0], [0.2, 0], [3, 0], [0.3, 0], [9, 0]], status=status)
+    calibrated_elsewhere_rows(report, "0005", CORRECTION, found)
+    rows = rows_of(report)
+    wrong, refused = (rows[f"real.calibrated_on_0005.{name}"] for name in ("wrong_of_localized", "right_but_refused"))
+    assert (wrong["value"], wrong["n"], wrong["holds"]) == (pytest.approx(1 / 3), 3, False)
+    assert (refused["value"], refused["n"], refused["holds"]) == (pytest.approx(0.2), 5, False)
+    assert wrong["why"] == "scale 1.50, offset -0.50"

@@ -1,13 +1,16 @@
 """Drawn maps keep what matters of real ones, and the measures of search are right."""
 
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from benchmarks.scale import search
+from benchmarks.scale.built import APART_M, copied
 from benchmarks.scale.drawn import Asked, DrawnViews, _step
 from benchmarks.scale.sources import HEADINGS, RealDescriptors
+from model_training.datasets.dataset import Dataset, scan_path
 from service.maps.index import vectors_of
 
 PLACES, SIZE = 60, 32
@@ -112,3 +115,15 @@ def test_the_time_of_a_search_is_that_of_one_query(real: RealDescriptors) -> Non
     asked: Asked = drawn.queries(4)
     assert search.search_ms(SimpleNamespace(shortlist=shortlist), asked, drawn[:1000], 100) > 0
     assert calls == [100] * 3 * 4
+
+
+def test_copies_of_a_town_lie_apart_and_share_the_scans(small_dataset: Dataset, tmp_path: Path) -> None:
+    town, poses = small_dataset, small_dataset.survey_poses()
+    both = copied(town, tmp_path / "both", 2)
+    copied_stamps, copied_poses = both.survey_trajectory()
+    assert len(copied_poses) == 2 * len(poses)
+    np.testing.assert_allclose(copied_poses[: len(poses)], poses, atol=1e-6)
+    np.testing.assert_allclose(copied_poses[len(poses) :, :3, 3], poses[:, :3, 3] + [APART_M, 0, 0], atol=1e-6)
+    assert (np.diff(copied_stamps) > 0).all()
+    np.testing.assert_array_equal(both.scan(len(poses)), town.scan(0))
+    assert scan_path(both.folder, 0).stat().st_ino == scan_path(town.folder, 0).stat().st_ino

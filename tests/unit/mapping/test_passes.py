@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from model_training.mapping import passes, work
 from model_training.mapping.passes import MOST, Passes, Targets, Vote, looked_through, tile_of
@@ -236,3 +237,54 @@ def test_where_no_ray_goes_there_is_no_vote():
 def test_an_empty_scan_looks_through_nothing():
     targets = targets_at([10.0, 0.0, 0.0], (1.0, 0.0, 0.0))
     assert looked_through(targets, np.array([0]), np.zeros((0, 3)), np.eye(4), behind_m=0.6).tolist() == []
+
+
+def slow_looked_through(targets, points, T_map_lidar, behind_m):
+    """Test voxel by voxel: the nearest point of each cell of half a degree, and the least range of a cell and the eight around it."""
+
+    def cell(p):
+        elevation, azimuth = np.rad2deg(np.arcsin(p[2] / np.linalg.norm(p))), np.rad2deg(np.arctan2(p[1], p[0]))
+        return int(np.floor((elevation + 45) / 0.5)), int(np.floor((azimuth + 180) / 0.5)) % 720
+
+    nearest = {}
+    for p in points:
+        row, column = cell(p)
+        if np.linalg.norm(p) > 2 and 0 <= row < 180:
+            old = nearest.get((row, column))
+            if old is None or np.linalg.norm(p) <= np.linalg.norm(old):
+                nearest[row, column] = p
+    found = []
+    for k, (position, normal) in enumerate(zip(targets.positions, targets.normals, strict=True)):
+        p = (position - T_map_lidar[:3, 3]) @ T_map_lidar[:3, :3]
+        away = np.linalg.norm(p)
+        row, column = cell(p)
+        if not 2 < away <= passes.REACH_M or (row, column) not in nearest:
+            continue
+        around = [nearest.get((row + a, (column + b) % 720)) for a in (-1, 0, 1) for b in (-1, 0, 1)]
+        least = min(np.linalg.norm(each) for each in around if each is not None)
+        end = nearest[row, column] @ T_map_lidar[:3, :3].T + T_map_lidar[:3, 3]
+        if least >= away * 1.01 + behind_m and abs((end - position) @ normal) > targets.voxel_m:
+            found.append(k)
+    return found
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_the_compiled_vote_is_that_of_a_slow_loop(seed):
+    rng = np.random.default_rng(seed)
+    turn = Rotation.random(random_state=seed).as_matrix()
+    T_map_lidar = transform_from(turn, rng.uniform(-50, 50, 3))
+    # Rays in a narrow sector, so that many cells have neighbours, and voxels on some of them.
+    azimuth, elevation = np.deg2rad(rng.uniform(170, 190, 900)), np.deg2rad(rng.uniform(-8, 8, 900))
+    rays = np.stack(
+        [np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)], axis=1
+    )
+    points = rays * rng.choice([1.5, 12.0, 25.0, 60.0], (900, 1), p=[0.05, 0.1, 0.45, 0.4])
+    positions = transform_points(T_map_lidar, rays[:400] * rng.uniform(1.0, 35.0, (400, 1)))
+    normals = rng.normal(size=(400, 3)).astype(np.float32)
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    tile = tile_of(positions)
+    targets = Targets(np.arange(400), positions, normals, tile, np.argsort(tile, kind="stable"), 0.3)
+    found = looked_through(targets, np.arange(400), points, T_map_lidar, behind_m=0.6)
+    expected = slow_looked_through(targets, points, T_map_lidar, 0.6)
+    assert 50 < len(expected) < 390
+    assert found.tolist() == expected

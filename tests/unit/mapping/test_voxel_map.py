@@ -274,3 +274,17 @@ def test_sums_of_a_map_out_of_reach_are_refused():
     far.add(far.origin + np.array([[0.1, 0.1, 0.1]]))
     with pytest.raises(DatasetError, match="400 km from the middle"):
         near.add_statistics(far.statistics())
+
+
+def test_surfels_take_little_more_memory_than_their_arrays():
+    """A voxel of a surfel has 56 bytes, and its surfel as many. The sums of the neighbours need no arrays of their own."""
+    rng = np.random.default_rng(2)
+    voxels = VoxelMap(0.3, np.zeros(3))
+    voxels.add(np.concatenate([rng.uniform([0, 0, 0], [90, 90, 0.6], (400_000, 3))] * 2))
+    count = len(voxels.sums()[0])
+    voxels.surfels()
+    tracemalloc.start()
+    voxels.surfels()
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 250 * count

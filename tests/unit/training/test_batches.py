@@ -119,3 +119,27 @@ def test_a_damaged_pack_is_named_with_the_remedy(pack_of, tmp_path, grid, damage
     path.unlink() if damage == "gone" else path.write_bytes(b"" if damage == "empty" else content[: len(content) // 2])
     with pytest.raises(DatasetError, match=r"ranges\.npy: the file is (missing|damaged)"):
         open_cities([folder], grid, turn_deg=TURN_DEG, pairs=4)
+
+
+def test_a_survey_view_has_the_columns_of_its_panorama(city, grid):
+    """Column c of a view shows the direction heading + azimuth of column c: its number in the panorama is counted here one by one."""
+    choice = city.choose(6, np.random.default_rng(1))
+    batch = city.read(choice)
+    for k in range(len(choice)):
+        towards = choice.queries[k, 2] + choice.turn_rad[k] - choice.places[k, 2] + grid.azimuths_rad
+        columns = [round((float(angle) + np.pi) / (2 * np.pi) * grid.around) % grid.around for angle in towards]
+        panorama = np.asarray(city.pack.panoramas[choice.place[k]], np.float32)
+        np.testing.assert_array_equal(batch.survey_ranges[k].numpy(), panorama[:, columns])
+        np.testing.assert_array_equal(
+            batch.query_ranges[k].numpy(), city.pack.ranges[choice.pairs[k]].astype(np.float32)
+        )
+
+
+def test_a_device_without_enough_memory_is_named_with_the_remedy(pack_folder, grid, monkeypatch):
+    def full(*_, **__):
+        raise torch.OutOfMemoryError("CUDA out of memory")
+
+    monkeypatch.setattr("model_training.training.batches.City", full)
+    with pytest.raises(DatasetError, match=r"the memory of cuda is full after 0 of 1 cities.*--cities") as error:
+        open_cities([pack_folder], grid, turn_deg=TURN_DEG, pairs=16, device=torch.device("cuda"))
+    assert error.value.field == "device"

@@ -9,7 +9,7 @@ import pytest
 _PROGRAM = """
 import re, sys, threading
 from pathlib import Path
-from service.runtime.heap import Trimmer, keep_little
+from service.heap import Trimmer, keep_little
 
 if sys.argv[1] == "kept little":
     keep_little(1)

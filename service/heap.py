@@ -18,16 +18,17 @@ LARGE_BYTES = 8 * 2**20
 _TRIM_AFTER_S = 0.25
 
 
-def keep_little(threads: int) -> None:
+def keep_little(threads: int, *, mapped_bytes: int = MAPPED_BYTES) -> None:
     """Limit the free memory that glibc keeps, in this process and its forks; do nothing without glibc.
 
     Args:
         threads: number of threads that work in parallel; it limits the number of arenas.
+        mapped_bytes: blocks of this size or more go back to the system as soon as they are free.
     """
     libc = ctypes.CDLL(None)
     if not hasattr(libc, "mallopt"):
         return
-    libc.mallopt(_M_MMAP_THRESHOLD, MAPPED_BYTES)
+    libc.mallopt(_M_MMAP_THRESHOLD, mapped_bytes)
     libc.mallopt(_M_TRIM_THRESHOLD, KEPT_BYTES)
     libc.mallopt(_M_ARENA_MAX, threads + 2)
 
