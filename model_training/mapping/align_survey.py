@@ -8,6 +8,7 @@ A common offset of all scans is unobservable. A prior holds each scan near its g
 """
 
 from collections.abc import Callable
+from functools import partial
 
 import numpy as np
 from jaxtyping import Float32, Float64, Int16
@@ -80,10 +81,14 @@ def aligned(dataset: Dataset, poses: Poses, kept: NDArray[np.int64], *, report: 
     now = poses[kept].copy()
     for done in range(ROUNDS):
         # A function, so that the map of a round is gone before the next one is built.
-        _align_once(scans, now, poses[kept], lambda k, done=done: report("survey", len(kept) * (1 + done) + k, steps))
+        _align_once(scans, now, poses[kept], partial(_told, report, len(kept) * (1 + done), steps))
     owner = np.clip(np.searchsorted(kept, np.arange(len(poses)), side="right") - 1, 0, len(kept) - 1)
     moved: Poses = (now @ np.linalg.inv(poses[kept]))[owner] @ poses
     return moved
+
+
+def _told(report: Report, before: int, steps: int, done: int) -> None:
+    report("survey", before + done, steps)
 
 
 def _align_once(scans: list[Stored], now: Poses, given: Poses, report: Callable[[int], None]) -> None:

@@ -322,7 +322,7 @@ def looked_through(
         behind_m: smallest distance between the voxel and the end of a ray behind it, metres. One hundredth of the range is added for
             errors of poses and beams.
     """
-    points, candidates = (np.ascontiguousarray(array) for array in (points, candidates))
+    points, candidates = np.ascontiguousarray(points), np.ascontiguousarray(candidates)
     T_lidar_map = np.ascontiguousarray(inverse(T_map_lidar)[:3])
     limits = np.array([_NEAREST_M, REACH_M, behind_m, targets.voxel_m])
     point_at, ranges, least = np.empty(_ROWS * _COLUMNS, np.int32), *np.empty((2, _ROWS * _COLUMNS))

@@ -24,8 +24,7 @@ const LayoutEntry streetfix_layout[] = {
 static int64_t cell_of(double x, double y, double z, double range)
 {
     const double row = floor((asin(z / range) * DEGREES + 45.0) / CELL_DEG);
-    if (!(row >= 0 && row < ROWS))
-        return -1;
+    if (!(row >= 0 && row < ROWS)) return -1;
     const int64_t column = (int64_t)floor((atan2(y, x) * DEGREES + 180.0) / CELL_DEG) % COLUMNS;
     return (int64_t)row * COLUMNS + column;
 }
@@ -42,8 +41,7 @@ static void least_around(const double *ranges, double *least)
         const double *here = ranges + row * COLUMNS, *above = row > 0 ? here - COLUMNS : here;
         const double *below = row < ROWS - 1 ? here + COLUMNS : here;
         double *found = least + row * COLUMNS;
-        for (int64_t c = 0; c < COLUMNS; c++)
-            found[c] = less_of(less_of(above[c], here[c]), below[c]);
+        for (int64_t c = 0; c < COLUMNS; c++) found[c] = less_of(less_of(above[c], here[c]), below[c]);
         const double first = found[0];
         double left = found[COLUMNS - 1];
         for (int64_t c = 0; c < COLUMNS; c++) {
@@ -72,8 +70,7 @@ int64_t streetfix_looked_through(const double *points, int64_t count, const doub
     for (int64_t i = 0; i < count; i++) {
         const double *p = points + 3 * i;
         const double range = sqrt(p[0] * p[0] + p[1] * p[1] + p[2] * p[2]);
-        if (!(range > nearest_m))
-            continue;
+        if (!(range > nearest_m)) continue;
         const int64_t cell = cell_of(p[0], p[1], p[2], range);
         if (cell >= 0 && range <= ranges[cell]) {
             ranges[cell] = range;
@@ -86,18 +83,15 @@ int64_t streetfix_looked_through(const double *points, int64_t count, const doub
         const double *m = positions + 3 * candidates[i];
         const double x = T[0] * m[0] + T[1] * m[1] + T[2] * m[2] + T[3], y = T[4] * m[0] + T[5] * m[1] + T[6] * m[2] + T[7];
         const double z = T[8] * m[0] + T[9] * m[1] + T[10] * m[2] + T[11], away = sqrt(x * x + y * y + z * z);
-        if (!(away > nearest_m && away <= reach_m))
-            continue;
+        if (!(away > nearest_m && away <= reach_m)) continue;
         const int64_t cell = cell_of(x, y, z, away);
-        if (cell < 0 || point_at[cell] < 0 || !(least[cell] >= away * 1.01 + behind_m))
-            continue;
+        if (cell < 0 || point_at[cell] < 0 || !(least[cell] >= away * 1.01 + behind_m)) continue;
         const double *end = points + 3 * point_at[cell];
         const float *n = normals + 3 * candidates[i];
         const double off = (end[0] - x) * (T[0] * n[0] + T[1] * n[1] + T[2] * n[2]) +
                            (end[1] - y) * (T[4] * n[0] + T[5] * n[1] + T[6] * n[2]) +
                            (end[2] - z) * (T[8] * n[0] + T[9] * n[1] + T[10] * n[2]);
-        if (fabs(off) > off_plane_m)
-            seen[found++] = candidates[i];
+        if (fabs(off) > off_plane_m) seen[found++] = candidates[i];
     }
     return found;
 }

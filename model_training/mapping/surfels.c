@@ -52,8 +52,7 @@ static void add_displaced(double *total, const float *m, double weight, double d
 /* One rotation of Jacobi's method: makes a[p][q] zero. v collects the axes as columns. */
 static void rotate(double a[3][3], double v[3][3], int p, int q)
 {
-    if (a[p][q] == 0)
-        return;
+    if (a[p][q] == 0) return;
     const double theta = (a[q][q] - a[p][p]) / (2 * a[p][q]);
     const double t = (theta < 0 ? -1 : 1) / (fabs(theta) + sqrt(theta * theta + 1));
     const double c = 1 / sqrt(t * t + 1), s = t * c;
@@ -88,10 +87,8 @@ static double least_axis(const double *total, double *axis)
         rotate(a, v, 1, 2);
     }
     int least = 0;
-    for (int k = 1; k < 3; k++)
-        least = a[k][k] < a[least][least] ? k : least;
-    for (int k = 0; k < 3; k++)
-        axis[k] = v[k][least];
+    for (int k = 1; k < 3; k++) least = a[k][k] < a[least][least] ? k : least;
+    for (int k = 0; k < 3; k++) axis[k] = v[k][least];
     return a[least][least];
 }
 
@@ -110,8 +107,7 @@ void streetfix_surfels(const int64_t *keys, const float *moments, int64_t count,
         double total[10] = {0}, points = 0;
         for (int c = 0; c < COLUMNS; c++) {
             const int64_t lowest = keys[i] + away[c] - 1;
-            while (at[c] < count && keys[at[c]] < lowest)
-                at[c]++;
+            while (at[c] < count && keys[at[c]] < lowest) at[c]++;
             for (int64_t k = at[c]; k < count && keys[k] <= lowest + 2; k++) {
                 const int dx = c / 3 - 1, dy = c % 3 - 1, dz = (int)(keys[k] - lowest) - 1;
                 const float *m = moments + MOMENTS * k;
@@ -120,12 +116,10 @@ void streetfix_surfels(const int64_t *keys, const float *moments, int64_t count,
             }
         }
         around[i] = points;
-        if (points < fewest)
-            continue;
+        if (points < fewest) continue;
         double axis[3];
         const double variance = least_axis(total, axis);
-        for (int k = 0; k < 3; k++)
-            normals[3 * i + k] = (float)axis[k];
+        for (int k = 0; k < 3; k++) normals[3 * i + k] = (float)axis[k];
         thickness_m[i] = (float)sqrt(variance > 0 ? variance : 0);
     }
 }
