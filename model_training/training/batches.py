@@ -1,7 +1,6 @@
 """Draw batches of pairs of one city. The caller may choose some pairs, to get hard negatives.
 
-A GPU holds whole packs in its memory. Views that a CPU cuts out and copies to it take seven times as long as a training step
-(decision 0166).
+A GPU holds whole packs in its memory and cuts the views out itself. Otherwise it waits for the CPU most of the time (decision 0167).
 """
 
 from dataclasses import dataclass
