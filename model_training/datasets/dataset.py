@@ -375,9 +375,11 @@ class Dataset:
                 field=str(path.name),
             )
         points = read_rows(path, size)
-        finite: NDArray[np.float32] = points[np.isfinite(points[:, :3]).all(axis=1)]
-        finite[:, 3] = np.maximum(np.nan_to_num(finite[:, 3], posinf=0.0), 0.0)
-        return finite
+        if not np.isfinite(points).all():  # rarely
+            points = points[np.isfinite(points[:, :3]).all(axis=1)]
+            points[:, 3] = np.nan_to_num(points[:, 3], posinf=0.0)
+        np.maximum(points[:, 3], 0.0, out=points[:, 3])
+        return points
 
     def number_in_survey(self, number: int) -> int:
         """Return the index of a scan in the whole survey. It differs from ``number`` if this dataset is a part of a survey.

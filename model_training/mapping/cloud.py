@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from model_training.mapping.preview import preview_webp
 from model_training.mapping.voxel_map import Surfels, VoxelMap
-from service.geometry.rigid import transform_points
+from service.geometry.rigid import lengths, transform_points
 from service.maps.content import BundleContent
 from service.registration.surfel_map import SurfelMap
 
@@ -24,7 +24,7 @@ def near(
         points: x, y, z (metres, frame of the LiDAR or its level frame) and intensity (n, 4).
         T_map_points: pose of the frame of the points (4, 4).
     """
-    reached = points[np.linalg.norm(points[:, :3], axis=1) < CLOUD_REACH_M]
+    reached = points[lengths(points[:, :3]) < CLOUD_REACH_M]
     return transform_points(T_map_points, reached[:, :3].astype(np.float64)), reached[:, 3]
 
 

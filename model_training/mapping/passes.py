@@ -31,7 +31,7 @@ from model_training.mapping.tiles import TilePart
 from model_training.mapping.voxel_map import VoxelMap
 from model_training.mapping.work import Arrays
 from service.compiled import load
-from service.geometry.rigid import inverse, transform_points
+from service.geometry.rigid import inverse, lengths, transform_points
 
 #: Edge of a tile of the ground, metres.
 TILE_M = 10.0
@@ -262,7 +262,7 @@ class Vote:
         for scan in scans:
             T = self.T_map_lidar[scan]
             points = clear_scan(self.dataset, int(self.numbers[scan]), self.settings)[:, :3].astype(np.float64)
-            near = points[np.linalg.norm(points, axis=1) <= REACH_M]
+            near = points[lengths(points) <= REACH_M]
             touched = np.unique(self.cloud.keys_of(transform_points(T, near)))
             at = np.searchsorted(targets.keys, touched)
             inside = at < len(targets.keys)

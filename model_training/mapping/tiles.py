@@ -51,10 +51,11 @@ class Square:
             margin_m: margin on all four sides, metres.
             positions: metres, map frame (n, 2) or (n, 3).
         """
-        low = np.array([self.column, self.row]) * self.tile_m - margin_m
-        high = np.array([self.column + 1, self.row + 1]) * self.tile_m + margin_m
-        xy = positions[:, :2]
-        return np.asarray(((xy >= low) & (xy < high)).all(axis=1))
+        inside = np.ones(len(positions), np.bool_)
+        for axis, number in enumerate((self.column, self.row)):
+            inside &= positions[:, axis] >= number * self.tile_m - margin_m
+            inside &= positions[:, axis] < (number + 1) * self.tile_m + margin_m
+        return inside
 
 
 @dataclass(frozen=True, slots=True, eq=False)

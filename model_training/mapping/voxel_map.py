@@ -21,8 +21,8 @@ from service.errors import DatasetError
 from service.registration.kernel import SURFEL
 from service.registration.surfel_map import TILE_M
 
-#: Library that the build compiles from ``surfels.c``.
-LIBRARY = Path(__file__).with_name("_surfels.so")
+#: Library that the build compiles from ``voxels.c``.
+LIBRARY = Path(__file__).with_name("_voxels.so")
 #: Number of cells along an axis. A key has 3 x 20 bits.
 _SPAN = 1 << 20
 #: Largest distance of a cell from the origin, in cells, up to which it and its neighbours have unique keys.
@@ -49,7 +49,22 @@ VOXEL = np.dtype(
 @cache
 def _library() -> ctypes.CDLL:
     arguments: list[Any] = [c_void_p, c_void_p, c_int64, c_double, c_void_p, c_double, c_void_p, c_void_p, c_void_p]
-    library = load(LIBRARY, constants={"MOMENTS": _MOMENTS, "SPAN": _SPAN, "ARGUMENTS": len(arguments)})
+    of_sums: list[Any] = [
+        c_void_p,
+        c_void_p,
+        c_int64,
+        c_void_p,
+        c_double,
+        c_int64,
+        c_void_p,
+        c_void_p,
+        c_void_p,
+        c_void_p,
+    ]
+    constants = {"MOMENTS": _MOMENTS, "SPAN": _SPAN, "ARGUMENTS": len(arguments), "SUM_ARGUMENTS": len(of_sums)}
+    library = load(LIBRARY, constants=constants)
+    library.streetfix_sums.argtypes = of_sums
+    library.streetfix_sums.restype = c_int64
     library.streetfix_surfels.argtypes = arguments
     library.streetfix_surfels.restype = None
     return library
@@ -130,21 +145,27 @@ class VoxelMap:
         Raises:
             DatasetError: a point lies beyond the reach of the map.
         """
-        cell = self._cells(points_map)
-        local = (points_map - self.origin) - (cell + 0.5) * self.voxel_m
-        # Sorted before the products: a point has three numbers, its moments have twelve.
-        keys = _keys_of_cells(cell)
-        order = np.argsort(keys, kind="stable")
-        keys = keys[order]
-        first = _first_of_each(keys)
-        moments = np.zeros((len(first), _MOMENTS), np.float32)
-        if len(first):
-            for column, values in enumerate(_moments_of(local[order]).T[: _BRIGHT.start]):
-                moments[:, column] = np.add.reduceat(values, first)
-            if intensity is not None:
-                moments[:, _BRIGHT.start] = np.add.reduceat(intensity[order].astype(np.float64), first)
-                moments[:, _BRIGHT.start + 1] = moments[:, 0]
-        self._add(keys[first], moments)
+        points = np.ascontiguousarray(points_map, np.float64)
+        count = len(points)
+        bright = None if intensity is None else np.ascontiguousarray(intensity, np.float32)
+        key_of, numbers = np.empty(count, np.int64), np.empty((2, count), np.int32)
+        keys, moments = np.empty(count, np.int64), np.empty((count, _MOMENTS), np.float32)
+        origin = np.ascontiguousarray(self.origin, np.float64)
+        found = _library().streetfix_sums(
+            points.ctypes.data,
+            None if bright is None else bright.ctypes.data,
+            count,
+            origin.ctypes.data,
+            self.voxel_m,
+            _FARTHEST,
+            key_of.ctypes.data,
+            numbers.ctypes.data,
+            keys.ctypes.data,
+            moments.ctypes.data,
+        )
+        if found < 0:
+            self._cells(points)  # raises, and names the point
+        self._add(keys[:found].copy(), moments[:found].copy())
 
     def add_sums(self, keys: NDArray[np.int64], moments: NDArray[np.floating[Any]]) -> None:
         """Add the ``sums`` of another map with the same voxel edge and the same origin.
@@ -357,8 +378,7 @@ def _axis_of_keys(keys: NDArray[np.int64], axis: int) -> NDArray[np.int64]:
 def _moments_of(local: NDArray[np.float64]) -> NDArray[np.float64]:
     x, y, z = local.T
     unknown = np.zeros(len(x))
-    # Row by row in memory: sums read one moment of all points after the other.
-    return np.array([np.ones(len(x)), x, y, z, x * x, x * y, x * z, y * y, y * z, z * z, unknown, unknown]).T
+    return np.stack([np.ones(len(x)), x, y, z, x * x, x * y, x * z, y * y, y * z, z * z, unknown, unknown], axis=1)
 
 
 def _summed(keys: NDArray[np.int64], moments: NDArray[_Float]) -> tuple[NDArray[np.int64], NDArray[_Float]]:

@@ -1,23 +1,85 @@
-/* Computes the normal and the thickness of each voxel of a map from its moments and those of its 26 neighbours; see voxel_map.py.
+/* Sums the points of a scan by voxel, and computes the normal and the thickness of each voxel of a map from its moments and those of its
+ * 26 neighbours; see voxel_map.py.
  *
- * Speed: a sixth of the time of NumPy (decision 0166). Keys ascend, so the neighbours of successive voxels do too: nine positions
- * that only move forward replace 27 searches. Plain C without global state. Python checks sizes and pointers. */
+ * Speed: both take a sixth of the time of NumPy (decision 0166). Plain C without global state. Python checks sizes and pointers. */
 #include <math.h>
 #include <stdint.h>
 
 #include "../../service/layout.h"
 
-/* Moments of a voxel: count, x, y, z, xx, xy, xz, yy, yz, zz, and two that do not count here. SPAN: cells along an axis.
- * ARGUMENTS: of streetfix_surfels. */
-enum { MOMENTS = 12, SPAN = 1 << 20, COLUMNS = 9, ARGUMENTS = 9 };
+/* Moments of a voxel: count, x, y, z, xx, xy, xz, yy, yz, zz, sum of brightness, number of points that have one. SPAN: cells along an axis.
+ * ARGUMENTS, SUM_ARGUMENTS: of streetfix_surfels and streetfix_sums. */
+enum { MOMENTS = 12, SPAN = 1 << 20, COLUMNS = 9, ARGUMENTS = 9, SUM_ARGUMENTS = 10, DIGITS = 256 };
 
 /* Compared with Python's constants when the library is loaded. */
 const LayoutEntry streetfix_layout[] = {
-    LAYOUT_CONSTANT(MOMENTS),
-    LAYOUT_CONSTANT(SPAN),
-    LAYOUT_CONSTANT(ARGUMENTS),
-    LAYOUT_END,
+    LAYOUT_CONSTANT(MOMENTS), LAYOUT_CONSTANT(SPAN), LAYOUT_CONSTANT(ARGUMENTS), LAYOUT_CONSTANT(SUM_ARGUMENTS), LAYOUT_END,
 };
+
+/* Sorts points by key and keeps the order of equal keys (radix sort, byte by byte). Bytes that all keys share cost one look. Returns the
+ * sorted numbers of the points: order or other. */
+static int32_t *sorted(const int64_t *keys, int64_t count, int32_t *order, int32_t *other)
+{
+    for (int64_t i = 0; i < count; i++) order[i] = (int32_t)i;
+    for (int shift = 0; shift < 64; shift += 8) {
+        int64_t start[DIGITS] = {0}, before = 0;
+        for (int64_t i = 0; i < count; i++) start[(keys[i] >> shift) & (DIGITS - 1)]++;
+        if (count == 0 || start[(keys[0] >> shift) & (DIGITS - 1)] == count) continue;
+        for (int digit = 0; digit < DIGITS; digit++) {
+            const int64_t here = start[digit];
+            start[digit] = before;
+            before += here;
+        }
+        for (int64_t i = 0; i < count; i++) other[start[(keys[order[i]] >> shift) & (DIGITS - 1)]++] = order[i];
+        int32_t *swapped = order;
+        order = other;
+        other = swapped;
+    }
+    return order;
+}
+
+/* points: map frame, m (count, 3). intensity: of their returns (count); NULL: unknown. origin: corner of a cell, m (3). farthest: largest
+ * distance of a cell from the origin, cells. key_of: memory for the keys of the points (count). numbers: memory for their order
+ * (2, count). Writes the keys of the voxels, ascending, to keys, and their moments to moments (count, MOMENTS). Returns the number of voxels;
+ * -1 if a point is too far away or not finite. */
+int64_t streetfix_sums(const double *points, const float *intensity, int64_t count, const double *origin, double voxel_m, int64_t farthest,
+                       int64_t *key_of, int32_t *numbers, int64_t *keys, float *moments)
+{
+    const double most = (double)farthest;
+    for (int64_t i = 0; i < count; i++) {
+        int64_t key = 0;
+        for (int k = 0; k < 3; k++) {
+            const double cell = floor((points[3 * i + k] - origin[k]) / voxel_m);
+            if (!(fabs(cell) <= most)) return -1;
+            key = key * SPAN + (int64_t)cell + SPAN / 2;
+        }
+        key_of[i] = key;
+    }
+    const int32_t *order = sorted(key_of, count, numbers, numbers + count);
+    int64_t found = 0;
+    for (int64_t i = 0; i < count;) {
+        const int64_t key = key_of[order[i]];
+        double middle[3], sum[MOMENTS] = {0};
+        for (int k = 0; k < 3; k++) {
+            const int64_t cell = (k == 0 ? key / ((int64_t)SPAN * SPAN) : k == 1 ? key / SPAN % SPAN : key % SPAN) - SPAN / 2;
+            middle[k] = ((double)cell + 0.5) * voxel_m;
+        }
+        for (; i < count && key_of[order[i]] == key; i++) {
+            const double *p = points + 3 * (int64_t)order[i];
+            const double x = (p[0] - origin[0]) - middle[0], y = (p[1] - origin[1]) - middle[1], z = (p[2] - origin[2]) - middle[2];
+            const double of_point[10] = {1, x, y, z, x * x, x * y, x * z, y * y, y * z, z * z};
+            for (int k = 0; k < 10; k++) sum[k] += of_point[k];
+            if (intensity) {
+                sum[10] += intensity[order[i]];
+                sum[11] += 1;
+            }
+        }
+        keys[found] = key;
+        for (int k = 0; k < MOMENTS; k++) moments[MOMENTS * found + k] = (float)sum[k];
+        found++;
+    }
+    return found;
+}
 
 /* Number of keys that are less than ``key``. */
 static int64_t less_than(const int64_t *keys, int64_t count, int64_t key)
@@ -92,7 +154,9 @@ static double least_axis(const double *total, double *axis)
     return a[least][least];
 }
 
-/* keys: of the voxels, ascending (count). moments: (count, MOMENTS). weights: of a neighbour, by the number of axes along which it is
+/* Keys ascend, so the neighbours of successive voxels do too: nine positions that only move forward replace 27 searches.
+ *
+ * keys: of the voxels, ascending (count). moments: (count, MOMENTS). weights: of a neighbour, by the number of axes along which it is
  * displaced (4). fewest: least number of points in a voxel and its neighbours together. Results, one for each voxel: around, this
  * number; normals (count, 3) and thickness_m, not set where around is less than fewest. */
 void streetfix_surfels(const int64_t *keys, const float *moments, int64_t count, double voxel_m, const double *weights, double fewest,
