@@ -16,7 +16,8 @@ from numpy.typing import NDArray
 
 from model_training.datasets.dataset import Dataset
 from model_training.mapping.voxel_map import VoxelMap, lattice_origin
-from service.geometry.rigid import lengths, transform_points
+from service.geometry.lengths import lengths
+from service.geometry.rigid import transform_points
 from service.registration.kernel import STATE, QueryPoints, SolverOptions, align
 from service.registration.surfel_map import SurfelMap
 

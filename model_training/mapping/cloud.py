@@ -7,7 +7,8 @@ from numpy.typing import NDArray
 
 from model_training.mapping.preview import preview_webp
 from model_training.mapping.voxel_map import Surfels, VoxelMap
-from service.geometry.rigid import lengths, transform_points
+from service.geometry.lengths import lengths
+from service.geometry.rigid import transform_points
 from service.maps.content import BundleContent
 from service.registration.surfel_map import SurfelMap
 

@@ -31,7 +31,8 @@ from model_training.mapping.tiles import TilePart
 from model_training.mapping.voxel_map import VoxelMap
 from model_training.mapping.work import Arrays
 from service.compiled import load
-from service.geometry.rigid import inverse, lengths, transform_points
+from service.geometry.lengths import lengths
+from service.geometry.rigid import inverse, transform_points
 
 #: Edge of a tile of the ground, metres.
 TILE_M = 10.0

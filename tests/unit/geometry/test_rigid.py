@@ -9,7 +9,6 @@ from service.geometry.rigid import (
     heading_of_body,
     heading_of_camera,
     inverse,
-    lengths,
     quaternion_xyzw_from,
     rotation_from_quaternion_xyzw,
     rotation_taking,
@@ -128,10 +127,3 @@ def test_headings_of_camera_and_body_agree_on_one_vehicle(heading, pitch, roll):
     T_map_camera = transform_from(R_map_body @ R_BODY_OPTICAL, np.zeros(3))
     assert heading_of_body(T_map_body) == pytest.approx(heading, abs=1e-9)
     assert heading_of_camera(T_map_camera) == pytest.approx(heading, abs=1e-9)
-
-
-@pytest.mark.parametrize("dtype", [np.float32, np.float64])
-def test_lengths_by_hand(dtype):
-    found = lengths(np.array([[3, 4, 0], [0, 0, 0], [-2, 3, 6]], dtype))
-    assert found.tolist() == [5, 0, 7]
-    assert found.dtype == dtype
