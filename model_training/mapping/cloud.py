@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from model_training.mapping.preview import preview_webp
-from model_training.mapping.voxel_map import Surfels, VoxelMap
+from model_training.mapping.voxel_map import VoxelMap
 from service.geometry.lengths import lengths
 from service.geometry.rigid import transform_points
 from service.maps.content import BundleContent
@@ -29,15 +29,18 @@ def near(
     return transform_points(T_map_points, reached[:, :3].astype(np.float64)), reached[:, 3]
 
 
-def prepared(cloud: VoxelMap, surfels: Surfels | None = None) -> SurfelMap | None:
+def prepared(cloud: VoxelMap) -> SurfelMap | None:
     """Prepare the cloud for registration; None if there is no surfel.
 
     Args:
         cloud: the voxel map.
-        surfels: surfels of ``cloud``; None computes them.
     """
-    found = cloud.surfels() if surfels is None else surfels
-    return SurfelMap.prepare(cloud.origin, *cloud.tiles(found)) if len(found.positions) else None
+    found = cloud.surfels()
+    if not len(found.positions):
+        return None
+    parts = cloud.tiles(found)
+    del found  # the grid takes the most memory of a build, and needs only the sorted copy
+    return SurfelMap.prepare(cloud.origin, *parts)
 
 
 def with_cloud(content: BundleContent, cloud: VoxelMap) -> BundleContent:
@@ -47,13 +50,16 @@ def with_cloud(content: BundleContent, cloud: VoxelMap) -> BundleContent:
         content: the map. Its own cloud, sums and preview are replaced.
         cloud: the voxel map of the cloud.
     """
-    surfels = cloud.surfels()
-    preview = preview_webp(surfels.positions, surfels.normals, content.T_map_place[:, :3, 3])
-    surfel_map = prepared(cloud, surfels)
-    del surfels  # they take as much memory as the sums that follow
+    surfel_map = prepared(cloud)
     return replace(
         content,
         cloud=surfel_map,
         statistics=None if surfel_map is None else cloud.statistics(),
-        preview_webp=preview,
+        preview_webp=_preview(cloud, content.T_map_place[:, :3, 3]),
     )
+
+
+def _preview(cloud: VoxelMap, track: NDArray[np.float64]) -> bytes:
+    # Surfels again, in a hundredth of the time of a build: to keep them would cost more memory than the grid.
+    found = cloud.surfels()
+    return preview_webp(found.positions, found.normals, track)

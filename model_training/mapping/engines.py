@@ -26,8 +26,8 @@ from service.heap import keep_little
 
 Engine = Literal["local", "ray"]
 ENGINES: tuple[Engine, ...] = get_args(Engine)
-#: Memory of a process that builds a tile: a part for the programs, and a part for each scan, bytes (decision 0161).
-PROCESS_BYTES, SCAN_BYTES = 300 << 20, 900 << 10
+#: Memory of a process that builds a tile: a part for the programs, and a part for each scan, bytes (decision 0166).
+PROCESS_BYTES, SCAN_BYTES = 300 << 20, 320 << 10
 #: Arrays of this size or more go back to the system as soon as they are free: scans are smaller, sums of voxels are larger.
 _MAPPED_BYTES = 2 << 20
 #: How often a tile is started before the build gives up, if the process that builds it dies: on this machine, and with Ray, whose

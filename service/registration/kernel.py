@@ -464,6 +464,7 @@ def _touched(
             keys.append((x << 2 * KEY_BITS) + (y << KEY_BITS) + z)
             numbers.append((inside + first).astype(np.int32))
     key, which = np.concatenate(keys), np.concatenate(numbers)
+    del keys, numbers  # a large map has no room for both copies
     order = np.lexsort((which, key))
     return key[order], which[order]
 
