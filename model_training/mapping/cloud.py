@@ -50,16 +50,13 @@ def with_cloud(content: BundleContent, cloud: VoxelMap) -> BundleContent:
         content: the map. Its own cloud, sums and preview are replaced.
         cloud: the voxel map of the cloud.
     """
+    preview = _preview(cloud, content.T_map_place[:, :3, 3])
     surfel_map = prepared(cloud)
-    return replace(
-        content,
-        cloud=surfel_map,
-        statistics=None if surfel_map is None else cloud.statistics(),
-        preview_webp=_preview(cloud, content.T_map_place[:, :3, 3]),
-    )
+    statistics = None if surfel_map is None else cloud.statistics()
+    return replace(content, cloud=surfel_map, statistics=statistics, preview_webp=preview)
 
 
 def _preview(cloud: VoxelMap, track: NDArray[np.float64]) -> bytes:
-    # Surfels again, in a hundredth of the time of a build: to keep them would cost more memory than the grid.
+    # Its own surfels, in a hundredth of the time of a build. To keep them for the grid would take the most memory of the build.
     found = cloud.surfels()
     return preview_webp(found.positions, found.normals, track)

@@ -213,7 +213,8 @@ class VoxelMap:
 
     def means(self) -> NDArray[np.float64]:
         """Return the mean of each voxel's points (n, 3), metres, map frame, in the order of ``sums``."""
-        return self._means_of(*self.sums())
+        self._merge()
+        return self._means_of(slice(None))
 
     def statistics(self) -> NDArray[Any]:
         """Return all voxels in the format of a bundle: (n,) of ``VOXEL``. The origin must come from ``lattice_origin``."""
@@ -310,19 +311,20 @@ class VoxelMap:
             normals.ctypes.data,
             thickness.ctypes.data,
         )
-        keep = around >= fewest
-        keys, own = self._keys[keep], self._moments[keep]
-        bright, told = own[:, _BRIGHT].T
-        brightness = np.divide(bright, told, out=np.full(len(own), np.nan, np.float32), where=told > 0)
-        points = own[:, 0].astype(np.uint32)
-        return Surfels(self._means_of(keys, own), normals[keep], thickness[keep], points, keys, brightness)
+        keep = np.flatnonzero(around >= fewest)
+        del around
+        bright, told = (self._moments[keep, column] for column in (_BRIGHT.start, _BRIGHT.start + 1))
+        brightness = np.divide(bright, told, out=np.full(len(keep), np.nan, np.float32), where=told > 0)
+        points = self._moments[keep, 0].astype(np.uint32)
+        return Surfels(self._means_of(keep), normals[keep], thickness[keep], points, self._keys[keep], brightness)
 
-    def _means_of(self, keys: NDArray[np.int64], moments: NDArray[np.float32]) -> NDArray[np.float64]:
+    def _means_of(self, voxels: NDArray[np.int64] | slice) -> NDArray[np.float64]:
         """Return the mean of the points of some voxels (n, 3), metres, map frame."""
+        keys, points = self._keys[voxels], self._moments[voxels, 0].astype(np.float64)
         means = np.empty((len(keys), 3))
-        for axis in range(3):
+        for axis in range(3):  # one after the other: a large map has no room for all
             centre = self.origin[axis] + (_axis_of_keys(keys, axis) + 0.5) * self.voxel_m
-            means[:, axis] = centre + moments[:, 1 + axis] / moments[:, 0].astype(np.float64)
+            means[:, axis] = centre + self._moments[voxels, 1 + axis] / points
         return means
 
     def tiles(self, found: "Surfels") -> tuple[NDArray[Any], NDArray[np.float64], NDArray[np.float32]]:
