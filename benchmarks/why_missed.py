@@ -109,8 +109,9 @@ WHY_MISSED: dict[str, Reason] = {
     ),
     "retrieval.paper_city.precise.recall_at_1_5m": Reason(
         0.9750799,
-        "78 of 3,130 queries miss, and 58 of them have their place among the ten nearest. The encoder before the training on random rigs "
-        "had 0.9792, and the one before stereo-matched depth 0.9840. Both trainings were chosen for real streets (decisions 0142 and 0154)",
+        "78 of 3,130 queries miss, and 58 of them have their place among the ten nearest. The encoder before the training on random "
+        "rigs had 0.9792, and the one before stereo-matched depth 0.9840. Both trainings were chosen for real streets (decisions 0142 "
+        "and 0154)",
     ),
     "retrieval.paper_city.precise.recall_at_10_5m": Reason(
         0.9936102,
@@ -140,8 +141,8 @@ WHY_MISSED: dict[str, Reason] = {
     ),
     "full.paper_city.precise.street_accuracy": Reason(
         0.9837061,
-        "46 of 3,130 answers are refused, 29 of them right: an answer needs a confidence of 0.9 since decision 0149. 5 accepted answers are "
-        "within 1 m, but across a street border. 2 accepted answers are more than 1 m off (5 before), the farthest 1.2 m. Tried: "
+        "46 of 3,130 answers are refused, 29 of them right: an answer needs a confidence of 0.9 since decision 0149. 5 accepted answers "
+        "are within 1 m, but across a street border. 2 accepted answers are more than 1 m off (5 before), the farthest 1.2 m. Tried: "
         "similarity at the pose and halves of the image (decision 0168)",
     ),
     "full.paper_city.precise.localized": Reason(
@@ -151,8 +152,8 @@ WHY_MISSED: dict[str, Reason] = {
     ),
     "full.paper_city.precise.mean_distance_error_m": Reason(
         0.0524530,
-        "It was 0.105 with two accepted answers above 5 m. Now the largest error is 1.2 m, and the answers within 1 m have a mean of 0.052 m: "
-        "the errors of the survey's poses, 0.03 m for each axis, are most of it (decision 0094)",
+        "It was 0.105 with two accepted answers above 5 m. Now the largest error is 1.2 m, and the answers within 1 m have a mean of "
+        "0.052 m: the errors of the survey's poses, 0.03 m for each axis, are most of it (decision 0094)",
     ),
     "full.paper_city.precise.forced_mean_distance_error_m": Reason(
         0.4874775,
