@@ -291,30 +291,22 @@ WHY_MISSED["rigs.worst_ece"] = Reason(
 WHY_MISSED["rigs.worst_within_1_m"] = Reason(
     0.158, "The worst family is the OAK-D, a small stereo rig with a narrow view. See rigs.oak_d.within_1_m"
 )
-WHY_MISSED["town.build_minutes"] = Reason(
-    21.560314383700096,
-    "Ten tiles read 36,301 scans for a survey of 21,441, because the scans within 90 m of a tile measure its cloud."
-    " Before tiles, the build "
-    "took 37.6 minutes. The site check and the traffic vote also read each scan again. Next step: one pass over the scans of a tile for "
-    "places, voxels and votes",
-)
 WHY_MISSED["town.build_peak_gib"] = Reason(
-    6.902514457702637,
-    "Two tiles of 500 m are built at the same time, with 3.4 GiB each. The sums of the voxels and the votes of all "
-    "scans of a tile cause it. "
-    "It does not grow with the survey: before tiles it was 11.2 GB. Tiles of 250 m need a third, but read each scan"
-    " three times. Next step: "
-    "smaller sums of voxels, with counts of 16 bits",
+    2.746302604675293,
+    "Two tiles of 500 m are built at the same time, with 1.3 to 1.4 GiB each: 5 million voxels with 56 bytes, and steps that hold several "
+    "arrays of this length. Decision 0166 reduced it from 6.9 GiB. Tried: surfels without copies of the sums, and the grid without the "
+    "surfels beside it (no further gain). It does not grow with the survey (town.build_peak_four_towns_over_one). Next step: a record of "
+    "the memory of each step of such a tile",
 )
 WHY_MISSED["town.kb_per_metre"] = Reason(
-    66.23347362529734,
+    66.24012065668579,
     "Surfels take 34.7 kB, the grid of the nearest surfel 15.1 kB, descriptors with their coarse copy 7.8 kB. The margins of ten tiles "
     "store surfels near their edges twice: without tiles the map has 45.9 kB (decision 0155). Next step: surfels of 16 bytes relative to "
     "their tile",
 )
 WHY_MISSED["town.precise.within_1_m"] = Reason(
-    0.968,
-    "491 of 500 answers are within 1 m when forced. 7 of these are refused, because a LOCALIZED answer needs a confidence of 0.9. Four "
+    0.964,
+    "490 of 500 answers are within 1 m when forced. 8 of these are refused, because a LOCALIZED answer needs a confidence of 0.9. Three "
     "queries have their place not among the first ten",
 )
 WHY_MISSED["town.precise.wrong_and_accepted"] = Reason(
@@ -322,8 +314,8 @@ WHY_MISSED["town.precise.wrong_and_accepted"] = Reason(
     "Two of 500 answers. The default allows one wrong answer among a hundred LOCALIZED ones",
 )
 WHY_MISSED["town.stereo.within_1_m"] = Reason(
-    0.906,
-    "Confidence causes most losses: 485 of 500 answers are within 1 m when forced, and 32 of these are refused. "
+    0.912,
+    "Confidence causes most losses: 483 of 500 answers are within 1 m when forced, and 27 of these are refused. "
     "None is accepted and wrong. "
     "The reason is that of full.unseen.stereo.within_1_m",
 )
