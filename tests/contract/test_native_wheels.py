@@ -13,7 +13,7 @@ from benchmarks.native.wheels import ROOT, build_wheel, has_gcc, libraries, pyth
 
 ziglang = pytest.importorskip("ziglang")
 ZIG = [sys.executable, "-m", "ziglang", "cc"]
-C_FILES = sorted((ROOT / "service").rglob("*.c"))
+C_FILES = sorted(path for folder in ("service", "model_training") for path in (ROOT / folder).rglob("*.c"))
 on_x86_64 = pytest.mark.skipif(platform.machine() != "x86_64", reason="the disassembler is asked for x86-64")
 with_gcc = pytest.mark.skipif(not has_gcc(), reason="no gcc on this machine")
 
