@@ -148,7 +148,8 @@ def test_a_pair_through_a_lens(
     request = pb.LocalizeRequest(**pair(parts), camera=message, depth_format=depth_format)
     assert of_message(stub.Localize(request)) == flat(rest)
     plain = posted(client, "/v1/localize", parts_of())
-    for axis, within_m in (("x", 0.2), ("y", 0.1), ("z", 0.1)):  # along this street of flat walls the standard deviation is 1 m
+    # Along this street of flat walls the standard deviation is 1 m.
+    for axis, within_m in (("x", 0.2), ("y", 0.1), ("z", 0.1)):
         assert rest["pose"]["position"][axis] == pytest.approx(plain["pose"]["position"][axis], abs=within_m)
     assert rest["camera_height"]["height_m"] == pytest.approx(1.5, abs=0.1)
 
