@@ -164,7 +164,10 @@ class VoxelMap:
             moments.ctypes.data,
         )
         if found < 0:
-            self._cells(points)  # raises, and names the point
+            self._cells(points)  # raises, and names the point, unless rounding puts it on the limit itself
+            raise DatasetError(
+                f"a point lies at the limit of the map, {self.reach_m / 1000:.0f} km from its middle", field="poses"
+            )
         self._add(keys[:found].copy(), moments[:found].copy())
 
     def add_sums(self, keys: NDArray[np.int64], moments: NDArray[np.floating[Any]]) -> None:

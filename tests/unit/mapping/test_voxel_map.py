@@ -288,3 +288,19 @@ def test_surfels_take_little_more_memory_than_their_arrays():
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     assert peak < 250 * count
+
+
+@pytest.mark.parametrize("voxel_m", [0.1, 0.3, 0.7])
+@pytest.mark.parametrize("side", [-1, 1])
+def test_a_point_at_the_limit_is_added_or_refused(voxel_m, side):
+    """Rounding decides which. Nothing else may come out: the sums of such a scan are not computed."""
+    voxels = VoxelMap(voxel_m, np.zeros(3))
+    for distance_m in np.nextafter(voxels.reach_m, [0.0, np.inf]).tolist() + [voxels.reach_m]:
+        point = np.array([[side * distance_m, 0.0, 0.0]])
+        before = len(voxels.sums()[0])
+        try:
+            voxels.add(point)
+        except DatasetError:
+            assert len(voxels.sums()[0]) == before
+        else:
+            assert voxels.means()[:, 0] == pytest.approx(side * voxels.reach_m, rel=1e-6)
