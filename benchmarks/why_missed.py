@@ -64,10 +64,10 @@ _BORDERS = (
     "of the vote gained half a point in four other cities, and nothing here"
 )
 _HEIGHTS = (
-    "Confidence causes most losses: forced answers within 1 m are 0.93, 0.945, 0.955, 0.975, 0.985 and 0.985 from 0.2 to 3.5 m, and at "
+    "Confidence causes most losses: forced answers within 1 m are 0.935, 0.935, 0.95, 0.97, 0.98 and 0.985 from 0.2 to 3.5 m, and at "
     "most 0.01 are accepted and wrong. The default needs a confidence of 0.9 since decision 0149. Tried: training on cameras of 0.3 to "
-    "3.2 m (decision 0154; forced at 0.2 m 0.815 -> 0.93), depth structure (decision 0159; accepted at 0.2 m 0.775 -> 0.84, at 3.5 m "
-    "0.885 -> 0.93). A given height gains nothing, because the estimate errs by 0.02 to 0.04 m. Next: low and high cameras in the "
+    "3.2 m (decision 0154; forced at 0.2 m 0.815 -> 0.93), depth structure and confirmation (decisions 0159 and 0165; accepted at 0.2 m "
+    "0.775 -> 0.88, at 3.5 m 0.885 -> 0.93). A given height gains nothing, because the estimate errs by 0.02 to 0.04 m. Next: low and high cameras in the "
     "calibration"
 )
 _OVER_BARE = (
@@ -181,17 +181,17 @@ WHY_MISSED: dict[str, Reason] = {
         "because the tails make the standard deviation large (see doubt.covariance_95_coverage). Next step: let the map build "
         "estimate the errors of the map",
     ),
-    "height.0.2.within_1_m": Reason(0.84, _HEIGHTS),
-    "height.0.2.given.within_1_m": Reason(0.84, _HEIGHTS),
-    "height.0.4.within_1_m": Reason(0.885, _HEIGHTS),
+    "height.0.2.within_1_m": Reason(0.88, _HEIGHTS),
+    "height.0.2.given.within_1_m": Reason(0.87, _HEIGHTS),
+    "height.0.4.within_1_m": Reason(0.89, _HEIGHTS),
     "height.0.4.given.within_1_m": Reason(0.89, _HEIGHTS),
-    "height.0.8.within_1_m": Reason(0.91, _HEIGHTS),
-    "height.0.8.given.within_1_m": Reason(0.89, _HEIGHTS),
-    "height.1.5.within_1_m": Reason(0.93, _HEIGHTS),
-    "height.1.5.given.within_1_m": Reason(0.935, _HEIGHTS),
+    "height.0.8.within_1_m": Reason(0.915, _HEIGHTS),
+    "height.0.8.given.within_1_m": Reason(0.92, _HEIGHTS),
+    "height.1.5.within_1_m": Reason(0.945, _HEIGHTS),
+    "height.1.5.given.within_1_m": Reason(0.95, _HEIGHTS),
     "height.2.5.given.within_1_m": Reason(0.95, _HEIGHTS),
     "height.3.5.within_1_m": Reason(0.93, _HEIGHTS),
-    "height.3.5.given.within_1_m": Reason(0.93, _HEIGHTS),
+    "height.3.5.given.within_1_m": Reason(0.92, _HEIGHTS),
     "real.kitti_0013.recall_at_1_10m": Reason(
         0.9583333,
         "One of 24 queries misses. With 24 queries the bar allows no miss. Retrieval alone finds 18 within 5 m, and "
