@@ -67,8 +67,8 @@ _HEIGHTS = (
     "Confidence causes most losses: forced answers within 1 m are 0.935, 0.935, 0.95, 0.97, 0.98 and 0.985 from 0.2 to 3.5 m, and at "
     "most 0.01 are accepted and wrong. The default needs a confidence of 0.9 since decision 0149. Tried: training on cameras of 0.3 to "
     "3.2 m (decision 0154; forced at 0.2 m 0.815 -> 0.93), depth structure and confirmation (decisions 0159 and 0165; accepted at 0.2 m "
-    "0.775 -> 0.88, at 3.5 m 0.885 -> 0.93). A given height gains nothing, because the estimate errs by 0.02 to 0.04 m. Next: low and high cameras in the "
-    "calibration"
+    "0.775 -> 0.88, at 3.5 m 0.885 -> 0.93). A given height gains nothing, because the estimate "
+    "errs by 0.02 to 0.04 m. Next: low and high cameras in the calibration"
 )
 _OVER_BARE = (
     "Medians of runs differ by up to 10 %: full REST 0.97 to 1.13, retrieval REST 1.14 to 1.27, gRPC 1.15 to 1.29. A full "
