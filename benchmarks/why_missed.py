@@ -130,8 +130,8 @@ WHY_MISSED: dict[str, Reason] = {
         0.947,
         "Confidence causes most losses. 64 of 3,000 queries have a forced error above 1 m. 148 answers are refused, and 95 of these "
         "are right: a LOCALIZED answer needs a confidence of 0.9, and 56 of the 95 have 0.65 to 0.9. 11 accepted answers are wrong "
-        "(0.4 %), none by more than 1.5 m. An earlier default reached 0.970, but accepted 29 wrong answers and 8 % of the images of another "
-        "city (now 0.0 %). Decision 0165 raised the value from 0.936. Tried: other models, 60 numbers of the image (decision 0165)",
+        "(0.4 %), none by more than 1.5 m. An earlier default reached 0.970, but accepted 29 wrong answers and 8 % of the images of "
+        "another city (now none). Decision 0165 raised the value from 0.936. Tried: other models, 60 numbers of the image (decision 0165)",
     ),
     "doubt.expected_calibration_error": Reason(
         0.0311502,
