@@ -100,6 +100,15 @@ def is_acceptable(
     return supported and bool(evidence[_SHARE] > _HALF)
 
 
+def share_of(evidence: Float64[NDArray[np.float64], " F"]) -> float:
+    """Return the share of the best candidate in the support of all distinct candidates, 0 to 1.
+
+    Args:
+        evidence: confidence features of the answer.
+    """
+    return float(np.exp(evidence[_SHARE]))
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Outcome:
     """How far an answer can be trusted.

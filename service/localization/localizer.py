@@ -8,6 +8,7 @@ from service.confidence.decision import decision_of, require_promise
 from service.confidence.features import evidence_of, require_features
 from service.confidence.spread import Extent
 from service.geometry.rigid import Transform
+from service.localization.agreement import registered
 from service.localization.answer import Answer
 from service.localization.compose import Found, compose
 from service.localization.refine import RefineSettings, refine
@@ -118,7 +119,7 @@ class Localizer:
             RequestError: the calibration does not support such a low false-accept rate.
             NotFiniteError: a number of the answer is not finite, because of a defect of this program or of the map.
         """
-        return self.compose(frames, self.register(frames))
+        return self.compose(frames, registered(self.register, self.bundle.calibration, frames))
 
     def register(self, frames: tuple[EncodedFrame, ...], predicted: tuple[Transform, ...] = ()) -> Found:
         """Retrieve, register and decide, without the parts of an answer that only its reader needs.

@@ -4,18 +4,16 @@ from dataclasses import dataclass, field, replace
 from functools import partial
 
 import numpy as np
-from jaxtyping import Float64
-from numpy.typing import NDArray
 
-from service.confidence.decision import Decision, decision_of, extrapolated
+from service.confidence.decision import Decision
 from service.geometry.rigid import Transform, inverse, nearest_rigid
+from service.localization.agreement import PREDICTED, agreed, believed, is_likely, seen_of
 from service.localization.answer import Answer, require_finite
-from service.localization.belief import Belief, Mode, Seen, agrees, moved, sighting_of, size_of
+from service.localization.belief import Belief, Mode, agrees, moved, size_of
 from service.localization.compose import Found
 from service.localization.localizer import Localizer
-from service.option_limits import FALSE_ACCEPT_RATE
 from service.retrieval.retrieve import EncodedFrame
-from service.scoring.candidates import RIVAL_M, Candidate, distinct_candidates, shares_of
+from service.scoring.candidates import RIVAL_M
 from service.timing import stage, timed_request
 
 #: Maximum number of frames that are registered together. Five frames resolve a street of repeating blocks (decision log).
@@ -24,10 +22,6 @@ MOST_FRAMES = 5
 APART_M, APART_RAD = 0.5, float(np.deg2rad(10.0))
 #: An answer is not accepted if its rivals leave it this probability or less.
 CONTRADICTED = 0.5
-#: An answer of the belief needs more than this probability, whatever the false-accept rate: more than all rivals together.
-MAJORITY = 0.5
-#: Number of modes whose predicted poses are starts of the registration.
-PREDICTED = 4
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -95,13 +89,13 @@ def follow(
     predicted = tuple(mode.T_map_camera for mode in belief.modes[:PREDICTED])
     alone = localizer.register((frame,), predicted)
     with stage("register"):
-        belief = _believed(localizer, frame, alone, belief)
+        belief = believed(bundle.calibration, frame, alone, belief)
     if _is_overtaken(last, belief):
         kept = ()
     answer = _answer(localizer, (frame, *_apart(kept)), alone, belief)
     epoch = track.epoch
     if answer.status == "LOCALIZED" and answer.candidates and answer.covariance is not None:
-        found = _seen(answer.candidates[0], answer.covariance, probability=answer.confidence or 0.0)
+        found = seen_of(answer.candidates[0], answer.covariance, probability=answer.confidence or 0.0)
         epoch += int(last is not None and not agrees(last, found.T_map_camera))
         belief = belief.raised(found)
         last = Mode(found.T_map_camera, found.covariance, found.probability, 0, found.inliers, found.similarity)
@@ -134,27 +128,6 @@ def _is_overtaken(last: Mode | None, belief: Belief) -> bool:
     return not agrees(last, first.T_map_camera) and first.weight > max(belief.elsewhere, belief.outside)
 
 
-def _believed(localizer: Localizer, frame: EncodedFrame, alone: Found, belief: Belief) -> Belief:
-    """Return the belief after a frame. A frame outside the range of the calibration says nothing at the default false-accept rate."""
-    calibration, decision = localizer.bundle.calibration, alone.decision
-    if alone.refined is None or calibration is None or decision is None:
-        return belief.unseen()
-    if frame.query.false_accept_rate <= FALSE_ACCEPT_RATE and extrapolated(calibration, alone.evidence):
-        return belief.unseen()
-    if belief.born and frame.query.prior is not None:  # a prior counts once, in the first frame of a track
-        decision = decision_of(calibration, replace(frame.query, prior=None), alone.refined, alone.evidence)
-        if decision is None:
-            return belief.unseen()
-    candidates = distinct_candidates(alone.refined.with_covariances())
-    seen = [_seen(each, each.covariance) for each in candidates if each.covariance is not None]
-    return belief.seen(sighting_of(seen, shares_of(candidates, 1), decision.confidence, decision.known))
-
-
-def _seen(candidate: Candidate, covariance: Float64[NDArray[np.float64], "6 6"], *, probability: float = 0.0) -> Seen:
-    inliers, similarity = candidate.registered.inliers, candidate.scores["similarity"]
-    return Seen(candidate.T_map_camera, covariance, probability, inliers, similarity)
-
-
 def _answer(localizer: Localizer, frames: tuple[EncodedFrame, ...], alone: Found, belief: Belief) -> Answer:
     """Build the answer from the frame alone, else from all frames together, else from the belief: the first that is accepted."""
     ceiling = partial(_ceiling, alone=alone, belief=belief)
@@ -165,12 +138,15 @@ def _answer(localizer: Localizer, frames: tuple[EncodedFrame, ...], alone: Found
         found, used = localizer.register(frames), frames
         if _is_localized(found) and ceiling(found) > CONTRADICTED:
             return localizer.compose(frames, found)
-    calibration, mode = localizer.bundle.calibration, belief.modes[0] if belief.modes else None
-    if calibration is not None and alone.refined is not None and mode is not None and mode.unseen == 0:
-        accepted = Decision("LOCALIZED", mode.weight, 1.0 - belief.outside)
-        if mode.weight > MAJORITY and mode.weight >= calibration.threshold(frames[0].query.false_accept_rate):
-            refined = alone.refined.led_by(mode.T_map_camera)
-            return localizer.compose(frames[:1], replace(alone, refined=refined, decision=accepted))
+    calibration = localizer.bundle.calibration
+    accepted = None if calibration is None else agreed(calibration, belief, frames[0].query.false_accept_rate)
+    if calibration is not None and accepted is not None and alone.refined is not None:
+        first, best = belief.modes[0], None if found.refined is None else found.refined.best
+        if best is not None and agrees(first, best.T_map_camera) and is_likely(calibration, frames[0], found):
+            # The pose of all frames is more accurate than that of the newest one.
+            return localizer.compose(used, replace(found, decision=accepted))
+        refined = alone.refined.led_by(first.T_map_camera)
+        return localizer.compose(frames[:1], replace(alone, refined=refined, decision=accepted))
     if found.decision is not None and found.decision.status == "LOCALIZED":
         doubted = Decision("AMBIGUOUS", min(found.decision.confidence, ceiling(found)), found.decision.known)
         found = replace(found, decision=doubted)

@@ -8,14 +8,17 @@ from typing import Any
 import numpy as np
 import pytest
 
+from service.confidence import decision
 from service.confidence.decision import Decision, Status
+from service.confidence.features import FEATURES
 from service.geometry.rigid import transform_from
-from service.localization import tracker
+from service.localization import agreement
 from service.localization.belief import KIDNAPPED, KIDNAPPED_ON_THE_WAY, NEW_M
 from service.localization.compose import Found
 from service.localization.localizer import Localizer
 from service.localization.track_bytes import MOST_BYTES, packed, unpacked
 from service.localization.tracker import MOST_FRAMES, Track, follow
+from service.maps.calibration import AdditiveModel, Calibration, FeatureStatistics, Threshold
 from service.maps.reader import MapBundle
 from service.registration.register import Registered
 from service.retrieval.prior import Prior
@@ -43,7 +46,21 @@ def found(confidence: float, *places: tuple[float, float], known: float | None =
     refined = Refined(candidates, SMALL, SMALL, 500, 1.0, Confirmation(0.0, 0.2, 1.7, 0.1), lambda _: SMALL)
     known = max(confidence, 0.98) if known is None else known
     status: Status = "LOCALIZED" if confidence >= THRESHOLD and places[0][1] > 0.5 else "AMBIGUOUS"
-    return Found(Retrieved((), (), None), refined, np.zeros(1), Decision(status, confidence, known))
+    return Found(Retrieved((), (), None), refined, np.zeros(len(FEATURES)), Decision(status, confidence, known))
+
+
+def calibration(threshold: float) -> Calibration:
+    """Return a calibration that has one threshold at every false-accept rate."""
+    model = AdditiveModel(terms=(), bias=0.0)
+    features = tuple(FeatureStatistics(name=name, mean=0.0, std=1.0) for name in FEATURES)
+    one = (Threshold(false_accept_rate=0.01, confidence=threshold),)
+    return Calibration(features=features, right=model, known=model, thresholds=one, measured_on={})
+
+
+def in_range(monkeypatch: pytest.MonkeyPatch, outside: tuple[tuple[str, float], ...] = ()) -> None:
+    """Replace the check of the calibration's range by a result."""
+    for module in (agreement, decision):
+        monkeypatch.setattr(module, "extrapolated", lambda *_: outside)
 
 
 class Scripted(Localizer):
@@ -51,7 +68,7 @@ class Scripted(Localizer):
 
     def __init__(self, template: Any, alone: list[Found], together: Found | None = None) -> None:
         self.template, self.alone, self.together = template, iter(alone), together
-        self.bundle: Any = SimpleNamespace(cloud=True, calibration=SimpleNamespace(threshold=lambda _: THRESHOLD))
+        self.bundle: Any = SimpleNamespace(cloud=True, calibration=calibration(THRESHOLD))
         self.predicted: list[int] = []
 
     def register(self, frames: tuple[EncodedFrame, ...], predicted: tuple[Any, ...] = ()) -> Found:
@@ -89,7 +106,7 @@ def frame(localizer, pictures):
 @pytest.fixture
 def drive(localizer, frame, monkeypatch):
     """Return a function that follows a robot over scripted registrations, and returns x, status, epoch and frames of each answer."""
-    monkeypatch.setattr(tracker, "extrapolated", lambda *_: ())
+    in_range(monkeypatch)
     template = localizer.answer((frame,))
 
     def run(alone: list[Found], together: Found | None = None) -> list[tuple[float, str, int, int]]:
@@ -116,6 +133,14 @@ def test_frames_that_are_unsure_alone_become_sure_by_agreement(drive):
     assert [status for _, status, _, _ in answers] == ["AMBIGUOUS", "LOCALIZED"]
 
 
+def test_the_frames_together_give_the_pose_if_they_agree_with_the_belief(drive):
+    """The belief accepts in both cases. The pose of all frames together is more accurate, but only if it has the majority."""
+    unsure = [found(0.7, (2.0 * k, 0.99)) for k in range(2)]
+    assert drive(unsure, together=found(0.6, (2.3, 0.9)))[-1] == (pytest.approx(2.3), "LOCALIZED", 0, 2)
+    assert drive(unsure, together=found(0.4, (2.3, 0.9)))[-1] == (2.0, "LOCALIZED", 0, 1)
+    assert drive(unsure, together=found(0.6, (9.0, 0.9)))[-1] == (2.0, "LOCALIZED", 0, 1)
+
+
 def test_frames_together_decide_what_one_frame_cannot(drive):
     alone = [found(0.3, (2.0 * k, 0.9)) for k in range(2)]
     assert drive(alone, together=found(0.95, (2.0, 0.95)))[-1] == (2.0, "LOCALIZED", 0, 2)
@@ -140,7 +165,7 @@ def test_a_displaced_robot_is_ambiguous_once_and_then_begins_an_epoch(drive):
 
 
 def test_unknown_odometry_begins_an_epoch_if_a_pose_was_given_before(localizer, frame, monkeypatch):
-    monkeypatch.setattr(tracker, "extrapolated", lambda *_: ())
+    in_range(monkeypatch)
     template = localizer.answer((frame,))
     scripted = Scripted(template, [found(0.2, (0.0, 0.9)), found(0.97, (0.0, 0.99)), found(0.97, (0.0, 0.99))])
     track, epochs = Track(), []
@@ -151,7 +176,7 @@ def test_unknown_odometry_begins_an_epoch_if_a_pose_was_given_before(localizer, 
 
 
 def test_the_modes_are_starts_of_the_next_registration(localizer, frame, monkeypatch):
-    monkeypatch.setattr(tracker, "extrapolated", lambda *_: ())
+    in_range(monkeypatch)
     scripted = Scripted(localizer.answer((frame,)), [found(0.6, (0.0, 0.7), (50.0, 0.3)), found(0.97, (2.0, 0.99))])
     _, track = follow(scripted, frame, Track(), None)
     follow(scripted, frame, track, AHEAD)
@@ -165,9 +190,9 @@ def test_a_frame_out_of_range_says_nothing_at_the_default_rate(localizer, frame,
     asked = replace(frame, query=replace(frame.query, false_accept_rate=rate))
     elsewhere = found(0.8, (50.0, 0.9))
     scripted = Scripted(template, [found(0.97, (0.0, 0.99)), elsewhere], together=elsewhere)
-    monkeypatch.setattr(tracker, "extrapolated", lambda *_: ())
+    in_range(monkeypatch)
     _, track = follow(scripted, asked, Track(), None)
-    monkeypatch.setattr(tracker, "extrapolated", lambda *_: (("far", 5.0),))
+    in_range(monkeypatch, (("far", 5.0),))
     answer, _ = follow(scripted, asked, track, AHEAD)
     assert answer.belief is not None
     first = answer.belief.modes[0]
@@ -188,8 +213,8 @@ def test_frames_of_one_position_are_not_registered_together(localizer, frame):
 
 def test_a_prior_counts_once(localizer, frame, monkeypatch):
     """The first frame uses its decision with the prior. Later frames decide again without it."""
-    monkeypatch.setattr(tracker, "extrapolated", lambda *_: ())
-    monkeypatch.setattr(tracker, "decision_of", lambda *_: Decision("AMBIGUOUS", 0.1, 0.2))
+    in_range(monkeypatch)
+    monkeypatch.setattr(agreement, "decision_of", lambda *_: Decision("AMBIGUOUS", 0.1, 0.2))
     asked = replace(frame, query=replace(frame.query, prior=Prior(position_m=np.zeros(2))))
     scripted = Scripted(
         localizer.answer((frame,)), [found(0.8, (2.0 * k, 0.99)) for k in range(2)], found(0.5, (2.0, 0.9))
@@ -203,7 +228,7 @@ def test_a_prior_counts_once(localizer, frame, monkeypatch):
 
 
 def test_a_frame_without_registration_keeps_the_belief(localizer, frame, monkeypatch):
-    monkeypatch.setattr(tracker, "extrapolated", lambda *_: ())
+    in_range(monkeypatch)
     scripted = Scripted(localizer.answer((frame,)), [found(0.97, (0.0, 0.99)), found(0.97, (100.0, 0.99))])
     scripted.answer = lambda *_: scripted.template  # type: ignore[method-assign]
     _, track = follow(scripted, frame, Track(), None)
@@ -225,7 +250,7 @@ def test_a_map_without_calibration_registers_the_last_frames_together(localizer,
 
 
 def test_a_carried_track_continues_as_a_kept_one(localizer, frame, monkeypatch):
-    monkeypatch.setattr(tracker, "extrapolated", lambda *_: ())
+    in_range(monkeypatch)
     frames = [found(0.97, (2.0 * k, 0.9), (50.0 + 2 * k, 0.1)) for k in range(2)]
     scripted = Scripted(localizer.answer((frame,)), frames)
     _, track = follow(scripted, frame, Track(epoch=3), AHEAD)
@@ -243,7 +268,7 @@ def test_a_carried_track_continues_as_a_kept_one(localizer, frame, monkeypatch):
 
 
 def test_a_carried_track_of_another_map_version_begins_an_epoch(localizer, frame, monkeypatch):
-    monkeypatch.setattr(tracker, "extrapolated", lambda *_: ())
+    in_range(monkeypatch)
     scripted = Scripted(localizer.answer((frame,)), [found(0.97, (0.0, 0.9))])
     _, track = follow(scripted, frame, Track(), None)
     other = unpacked(packed(track, map_version="tiny@1"), map_version="tiny@2")
