@@ -26,6 +26,7 @@ from model_training.mapping.tiles import TILE_MARGIN_M
 from model_training.mapping.voxel_map import VoxelMap, lattice_origin
 from model_training.mapping.work import key_of, work_beside
 from service.errors import BundleError, DatasetError
+from service.heap import trim
 from service.imaging.view_grid import ViewGrid
 from service.maps import inverted_file
 from service.maps.calibration import Calibration, Site
@@ -112,6 +113,7 @@ def write_from(
     # 1. Places with their map views, and the voxel map of the points.
     places, cloud = stages.places(drive, _cloud_around(drive.poses, drive.settings), apart=apart)
     content = _content(drive, places, encoder_file, lidar_height_m)
+    trim()  # reading the scans leaves much free memory between used blocks, and the grid needs large ones
     # 2. Confidence on this site, checked with scans that are not in the map yet.
     if calibration is not None:
         site = _checked(stages, drive, places, content, cloud, calibration, apart)
@@ -123,6 +125,7 @@ def write_from(
             dynamic = stages.dynamic_voxels(cloud, drive.poses, each_scan=each_scan)
             cloud.keep(~np.isin(cloud.sums()[0], dynamic))
     # 4. The bundle.
+    trim()
     stages.report("writing", 0, 2)
     content = with_cloud(content, cloud)
     del cloud  # the content has all that the bundle needs

@@ -9,6 +9,7 @@ from model_training.mapping.preview import preview_webp
 from model_training.mapping.voxel_map import VoxelMap
 from service.geometry.lengths import lengths
 from service.geometry.rigid import transform_points
+from service.heap import trim
 from service.maps.content import BundleContent
 from service.registration.surfel_map import SurfelMap
 
@@ -35,12 +36,10 @@ def prepared(cloud: VoxelMap) -> SurfelMap | None:
     Args:
         cloud: the voxel map.
     """
-    found = cloud.surfels()
-    if not len(found.positions):
-        return None
-    parts = cloud.tiles(found)
-    del found  # the grid takes the most memory of a build, and needs only the sorted copy
-    return SurfelMap.prepare(cloud.origin, *parts)
+    surfels, tiles, brightness = cloud.surfels_by_tile()
+    found = SurfelMap.prepare(cloud.origin, surfels, tiles, brightness) if len(surfels) else None
+    trim()  # the grid is made of many small blocks at first
+    return found
 
 
 def with_cloud(content: BundleContent, cloud: VoxelMap) -> BundleContent:

@@ -34,6 +34,10 @@ _MOMENTS, _BRIGHT = 12, slice(10, 12)
 #: Weight of a neighbour's points in a normal, by the number of axes along which it is displaced. Equal weights smooth the balconies and
 #: recesses of a facade into one slope. Smaller weights (0.1, 0.02, 0.005) follow the noise of the survey (decision 0098).
 _NEIGHBOUR = (1.0, 0.3, 0.1, 0.03)
+#: Smallest number of points in a voxel and its 26 neighbours together that make a surfel.
+FEWEST = 5
+#: Number of voxels that are converted at a time, so that their copies stay small.
+_PART = 1 << 18
 #: Smallest number of waiting rows of sums that starts a merge.
 _WAITING = 1 << 19
 _Float = TypeVar("_Float", np.float32, np.float64)
@@ -223,10 +227,11 @@ class VoxelMap:
         """Return all voxels in the format of a bundle: (n,) of ``VOXEL``. The origin must come from ``lattice_origin``."""
         keys, moments = self.sums()
         found = np.zeros(len(keys), VOXEL)
-        for axis, corner in enumerate(self._lattice()):
-            found["cell"][:, axis] = _axis_of_keys(keys, axis) + corner
-        found["points"], found["sums"] = moments[:, 0], moments[:, 1 : _BRIGHT.start]
-        found["brightness"], found["bright_points"] = moments[:, _BRIGHT].T
+        for part in _parts(len(keys)):
+            for axis, corner in enumerate(self._lattice()):
+                found["cell"][part, axis] = _axis_of_keys(keys[part], axis) + corner
+            found["points"][part], found["sums"][part] = moments[part, 0], moments[part, 1 : _BRIGHT.start]
+            found["brightness"][part], found["bright_points"][part] = moments[part, _BRIGHT].T
         return found
 
     def add_statistics(self, statistics: NDArray[Any]) -> None:
@@ -293,12 +298,50 @@ class VoxelMap:
         sums[old], sums[fresh] = self._moments, moments[~known]
         self._keys, self._moments = keys, sums
 
-    def surfels(self, *, fewest: int = 5) -> "Surfels":
+    def surfels(self, *, fewest: int = FEWEST) -> "Surfels":
         """Compute one surfel for each voxel with enough points for a normal.
 
         Args:
             fewest: smallest number of points in the voxel and its 26 neighbours together.
         """
+        keep, normals, thickness = self._surfaces(fewest)
+        points = self._moments[keep, 0].astype(np.uint32)
+        return Surfels(
+            self._means_of(keep), normals[keep], thickness[keep], points, self._keys[keep], self._brightness_of(keep)
+        )
+
+    def surfels_by_tile(self) -> tuple[NDArray[Any], NDArray[np.float64], NDArray[np.float32]]:
+        """Compute the surfels, sorted by tile, in the format of ``SurfelMap.prepare``.
+
+        The positions are float32. Their resolution is 0.1 mm up to 1 km from the origin, and 1 mm up to 16 km. The surfels are filled in a
+        part at a time: a map of five million surfels has no room for copies.
+
+        Returns:
+            Surfels (n,) of ``SURFEL`` with positions relative to ``origin``; tiles (T, 4): centre x, y (metres, same frame), first surfel
+            and number of surfels; brightness of each surfel (n,).
+        """
+        keep, normals, thickness = self._surfaces(FEWEST)
+        tile = np.empty(len(keep), np.int64)
+        for part in _parts(len(keep)):
+            x, y = np.floor((self._means_of(keep[part])[:, :2] - self.origin[:2]) / TILE_M).astype(np.int64).T
+            tile[part] = x * _SPAN + y  # both are far below _SPAN / 2
+        order = np.argsort(tile, kind="stable")
+        tile, keep = tile[order], keep[order]
+        first = _first_of_each(tile)
+        column = np.rint(tile[first] / _SPAN)
+        corners = np.stack([column, tile[first] - column * _SPAN], axis=1)
+        del order, tile
+        surfels, brightness = np.zeros(len(keep), SURFEL), np.empty(len(keep), np.float32)
+        for part in _parts(len(keep)):
+            rows = keep[part]
+            surfels["xyz"][part] = self._means_of(rows) - self.origin
+            surfels["normal"][part], surfels["thickness_m"][part] = normals[rows], thickness[rows]
+            surfels["points"][part], brightness[part] = self._moments[rows, 0], self._brightness_of(rows)
+        count = np.diff(np.r_[first, len(keep)])
+        return surfels, np.c_[(corners + 0.5) * TILE_M, first, count], brightness
+
+    def _surfaces(self, fewest: int) -> tuple[NDArray[np.int64], NDArray[np.float32], NDArray[np.float32]]:
+        """Return the rows of the voxels with a surfel, and the normal and the thickness (m) of all voxels."""
         self._merge()
         count = len(self._keys)
         around, normals, thickness = np.empty(count), np.empty((count, 3), np.float32), np.empty(count, np.float32)
@@ -314,12 +357,11 @@ class VoxelMap:
             normals.ctypes.data,
             thickness.ctypes.data,
         )
-        keep = np.flatnonzero(around >= fewest)
-        del around
-        bright, told = (self._moments[keep, column] for column in (_BRIGHT.start, _BRIGHT.start + 1))
-        brightness = np.divide(bright, told, out=np.full(len(keep), np.nan, np.float32), where=told > 0)
-        points = self._moments[keep, 0].astype(np.uint32)
-        return Surfels(self._means_of(keep), normals[keep], thickness[keep], points, self._keys[keep], brightness)
+        return np.flatnonzero(around >= fewest), normals, thickness
+
+    def _brightness_of(self, rows: NDArray[np.int64]) -> NDArray[np.float32]:
+        bright, told = (self._moments[rows, column] for column in (_BRIGHT.start, _BRIGHT.start + 1))
+        return np.divide(bright, told, out=np.full(len(rows), np.nan, np.float32), where=told > 0)
 
     def _means_of(self, voxels: NDArray[np.int64] | slice) -> NDArray[np.float64]:
         """Return the mean of the points of some voxels (n, 3), metres, map frame."""
@@ -329,35 +371,6 @@ class VoxelMap:
             centre = self.origin[axis] + (_axis_of_keys(keys, axis) + 0.5) * self.voxel_m
             means[:, axis] = centre + self._moments[voxels, 1 + axis] / points
         return means
-
-    def tiles(self, found: "Surfels") -> tuple[NDArray[Any], NDArray[np.float64], NDArray[np.float32]]:
-        """Sort surfels by tile, in the format of ``SurfelMap.prepare``.
-
-        The positions are float32. Their resolution is 0.1 mm up to 1 km from the origin, and 1 mm up to 16 km.
-
-        Args:
-            found: the surfels.
-
-        Returns:
-            Surfels (n,) of ``SURFEL`` with positions relative to ``origin``; tiles (T, 4): centre x, y (metres, same frame), first surfel
-            and number of surfels; brightness of each surfel (n,).
-        """
-        # Axis by axis: a map of five million surfels fits into memory only without copies of all positions.
-        x, y = (np.floor((found.positions[:, axis] - self.origin[axis]) / TILE_M).astype(np.int64) for axis in (0, 1))
-        tile = x * _SPAN + y  # both are far below _SPAN / 2
-        del x, y
-        order = np.argsort(tile, kind="stable")
-        tile = tile[order]
-        first = _first_of_each(tile)
-        column = np.rint(tile[first] / _SPAN)
-        corners = np.stack([column, tile[first] - column * _SPAN], axis=1)
-        surfels = np.zeros(len(order), SURFEL)
-        for axis in range(3):
-            surfels["xyz"][:, axis] = (found.positions[:, axis] - self.origin[axis])[order]
-        surfels["normal"], surfels["thickness_m"] = found.normals[order], found.thickness_m[order]
-        surfels["points"] = found.points[order]
-        count = np.diff(np.r_[first, len(order)])
-        return surfels, np.c_[(corners + 0.5) * TILE_M, first, count], found.brightness[order]
 
 
 def lattice_origin(voxel_m: float, near: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -392,6 +405,10 @@ def _summed(keys: NDArray[np.int64], moments: NDArray[_Float]) -> tuple[NDArray[
     keys, moments = keys[order], moments[order]
     first = _first_of_each(keys)
     return keys[first], np.add.reduceat(moments, first, axis=0) if len(first) else moments
+
+
+def _parts(count: int) -> list[slice]:
+    return [slice(first, min(first + _PART, count)) for first in range(0, count, _PART)]
 
 
 def _first_of_each(keys: NDArray[np.int64]) -> NDArray[np.int64]:

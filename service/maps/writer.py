@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from pydantic import ValidationError
 
 from service.errors import BundleError
+from service.geometry.lengths import lengths
 from service.maps import content as parts
 from service.maps import index, inverted_file, manifest, streets
 from service.maps.byte_planes import write_records
@@ -241,7 +242,7 @@ def _require_valid(content: BundleContent) -> None:
         what = f"a place refers to a street that is not among the {named} of streets.geojson"
     elif not np.isfinite(content.descriptors).all():
         what = "a descriptor is not finite"
-    elif (np.abs(np.linalg.norm(content.descriptors, axis=1) - 1) > index.LENGTH_OFF).any():
+    elif (np.abs(lengths(content.descriptors) - 1) > index.LENGTH_OFF).any():
         what = "a descriptor is not a unit vector"
     elif not parts.are_poses(content.T_map_place):
         what = parts.NO_POSE

@@ -39,6 +39,7 @@ def ask(frames, monkeypatch):
     def run(together, alone, of=frames):
         rest = iter(alone)
         answer = registered(lambda some, _: together if len(some) > 1 else next(rest), calibration(THRESHOLD), of)
+        assert answer.decision is not None
         return answer.decision.status, answer.decision.confidence, len(alone) - len(list(rest))
 
     return run

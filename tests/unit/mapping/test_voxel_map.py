@@ -100,7 +100,7 @@ def test_tiles_hold_every_surfel_once_and_within_their_edges():
     rng = np.random.default_rng(3)
     voxels = map_of(rng.uniform([0, -100, 0], [200, 60, 1], (60000, 3)), voxel_m=2.0)
     surfels = voxels.surfels()
-    own, rows, _ = voxels.tiles(surfels)
+    own, rows, _ = voxels.surfels_by_tile()
     assert rows[:, 3].sum() == len(own) == len(surfels.positions)
     np.testing.assert_array_equal(rows[:, 2], np.r_[0, np.cumsum(rows[:, 3])[:-1]])
     tree: Any = cKDTree(own["xyz"] + voxels.origin)
@@ -109,6 +109,22 @@ def test_tiles_hold_every_surfel_once_and_within_their_edges():
     assert len(set(nearest.tolist())) == len(own)
     inside = own["xyz"][:, :2] - np.repeat(rows[:, :2], rows[:, 3].astype(int), axis=0)
     assert np.abs(inside).max() <= TILE_M / 2 + 1e-3
+
+
+def test_surfels_by_tile_are_the_same_surfels(monkeypatch):
+    """Parts of 1,000 voxels; 2 x 2 tiles."""
+    monkeypatch.setattr("model_training.mapping.voxel_map._PART", 1000)
+    rng = np.random.default_rng(8)
+    points = rng.uniform([0, 0, 0], [70, 70, 1], (60000, 3))
+    voxels = lit(points, points[:, 2], origin=(0.0, 0.0, 0.0))
+    plain, (sorted_by_tile, tiles, brightness) = voxels.surfels(), voxels.surfels_by_tile()
+    order = np.lexsort(np.floor(plain.positions[:, 1::-1] / TILE_M).T)
+    assert len(tiles) == 4
+    np.testing.assert_array_equal(sorted_by_tile["xyz"], plain.positions[order].astype(np.float32))
+    np.testing.assert_array_equal(sorted_by_tile["normal"], plain.normals[order])
+    np.testing.assert_array_equal(sorted_by_tile["thickness_m"], plain.thickness_m[order])
+    np.testing.assert_array_equal(sorted_by_tile["points"], plain.points[order])
+    np.testing.assert_array_equal(brightness, plain.brightness[order])
 
 
 def test_coordinates_far_from_zero_lose_nothing():
@@ -173,7 +189,7 @@ def test_brightness_goes_along_with_its_surfel():
     rng = np.random.default_rng(6)
     points = rng.uniform([0, -100, 0], [200, 60, 1], (60000, 3))
     voxels = lit(points, points[:, 0], voxel_m=2.0)
-    surfels, _, brightness = voxels.tiles(voxels.surfels())
+    surfels, _, brightness = voxels.surfels_by_tile()
     assert np.abs(brightness - (surfels["xyz"][:, 0] + voxels.origin[0])).max() < 1e-3
 
 
