@@ -321,8 +321,8 @@ WHY_MISSED["town.stereo.within_1_m"] = Reason(
 )
 WHY_MISSED["town.sequence5.stereo.within_1_m"] = Reason(
     0.95,
-    "98 of 100 sequences are within 1 m when forced, and three of these are refused: a LOCALIZED answer needs a confidence of 0.9. Decision "
-    "0165 raised the value from 0.88 to 0.94, frames that confirm each other to 0.95 (decision 0169)",
+    "98 of 100 sequences are within 1 m when forced, and three of these are refused: a LOCALIZED answer needs a confidence of 0.9. "
+    "Decision 0165 raised the value from 0.88 to 0.94, frames that confirm each other to 0.95 (decision 0169)",
 )
 WHY_MISSED["train.two_process_loss_gap"] = Reason(
     0.05326234099074938,

@@ -225,11 +225,10 @@ def _checked(
     scans = list(levelled_scans(drive.dataset, drive.kept[numbers], drive.settings))
     held = [HeldScan(scan.points, scan.T_map_level(drive.poses[scan.number])) for scan in scans]
 
-    def check() -> Site:
-        rest = of_places(content, ~places.rendered_from(apart))
-        return site_of(replace(rest, cloud=prepared(cloud)), held, calibration, stages.report)
+    def rest() -> BundleContent:
+        return replace(of_places(content, ~places.rendered_from(apart)), cloud=prepared(cloud))
 
-    site = stages.site(calibration, check)
+    site = stages.site(calibration, lambda: site_of(rest, held, calibration, stages.report))
     for scan in scans:
         cloud.add(*drive.cloud_points(scan.points, scan.T_map_level(drive.poses[scan.number])))
     return site

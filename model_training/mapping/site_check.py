@@ -66,7 +66,10 @@ def held_out(places: int) -> set[int]:
 
 
 def site_of(
-    content: BundleContent, held: list[HeldScan], calibration: Calibration, report: Report = lambda *_: None
+    content_of: Callable[[], BundleContent],
+    held: list[HeldScan],
+    calibration: Calibration,
+    report: Report = lambda *_: None,
 ) -> Site:
     """Localize the held-out scans in the map without them, and fit the offset of the confidence.
 
@@ -74,7 +77,8 @@ def site_of(
     camera.
 
     Args:
-        content: the map without places that a held-out scan takes part in. Its cloud must not contain the held-out scans.
+        content_of: returns the map without places that a held-out scan takes part in. Its cloud must not contain the held-out scans. The
+            map is written and then read from disk, so it must not stay in memory a second time.
         held: the held-out scans.
         calibration: the calibration to check.
         report: called after every query.
@@ -84,10 +88,11 @@ def site_of(
     """
     confidence, right = [], []
     with tempfile.TemporaryDirectory(prefix="streetfix-site-") as folder:
-        write_bundle(Path(folder) / "map", _to_check(content))
-        localizer = Localizer.open(MapBundle.open(Path(folder) / "map", verify=False))
+        write_bundle(Path(folder) / "map", _to_check(content_of()))
+        bundle = MapBundle.open(Path(folder) / "map", verify=False)
+        localizer = Localizer.open(bundle)
         for number, scan in enumerate(held):
-            query, T_map_camera = _drawn(scan, content.grid, number)
+            query, T_map_camera = _drawn(scan, bundle.grid, number)
             answer = localizer.localize(query)
             odds = None if answer.evidence is None else float(calibration.log_odds("right", answer.evidence))
             confidence.append(-30.0 if odds is None else odds)

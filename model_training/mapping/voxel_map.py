@@ -361,7 +361,8 @@ class VoxelMap:
 
     def _brightness_of(self, rows: NDArray[np.int64]) -> NDArray[np.float32]:
         bright, told = (self._moments[rows, column] for column in (_BRIGHT.start, _BRIGHT.start + 1))
-        return np.divide(bright, told, out=np.full(len(rows), np.nan, np.float32), where=told > 0)
+        mean: NDArray[np.float32] = np.divide(bright, told, out=np.full(len(rows), np.nan, np.float32), where=told > 0)
+        return mean
 
     def _means_of(self, voxels: NDArray[np.int64] | slice) -> NDArray[np.float64]:
         """Return the mean of the points of some voxels (n, 3), metres, map frame."""

@@ -1,3 +1,4 @@
+import weakref
 from dataclasses import replace
 
 import numpy as np
@@ -201,7 +202,7 @@ def asked(content, calibration, scan, *, right, bias, count=30, monkeypatch):
     truth = scan.T_map_level
     monkeypatch.setattr(site_check, "Localizer", Answering)
     monkeypatch.setattr(site_check, "_drawn", lambda *_: (None, truth))
-    return site_of(content, [scan] * count, calibration(right=bias))
+    return site_of(lambda: content, [scan] * count, calibration(right=bias))
 
 
 @pytest.fixture
@@ -237,8 +238,22 @@ def test_a_real_map_is_searched_without_the_held_out_places(content, calibrated_
     told = []
     calibration = calibrated_at(right=np.log(3))
     rest = of_places(content, np.arange(len(content.T_map_place)) != 8)
-    found = site_of(rest, [scan_of_pictures], calibration, lambda *event: told.append(event))
+    found = site_of(lambda: rest, [scan_of_pictures], calibration, lambda *event: told.append(event))
     assert told == [("site check", 1, 1)]
     assert found.queries == 1
     assert found.offset <= 0
     assert len(content.T_map_place) == 12
+
+
+def test_the_map_is_not_in_memory_while_it_is_read_from_disk(content, calibrated_at, scan_of_pictures):
+    """The descriptors that were written are gone when the first query has its answer."""
+    written, alive = [], []
+
+    def content_of():
+        fresh = replace(content, descriptors=content.descriptors.copy())
+        written.append(weakref.ref(fresh.descriptors))
+        return fresh
+
+    site_of(content_of, [scan_of_pictures], calibrated_at(right=0.0), lambda *_: alive.append(written[0]()))
+    assert len(alive) == 1
+    assert alive[0] is None
