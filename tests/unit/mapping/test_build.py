@@ -287,8 +287,8 @@ def test_a_scan_that_is_held_out_takes_no_part_in_the_map_to_check(
     monkeypatch.setattr(site_check, "FEWEST", 2)
     checked = []
 
-    def noted(content, held, *_):
-        checked.append((content.T_map_place[:, :2, 3], [scan.T_map_level[:2, 3] for scan in held]))
+    def noted(content_of, held, *_):
+        checked.append((content_of().T_map_place[:, :2, 3], [scan.T_map_level[:2, 3] for scan in held]))
         return Site(offset=0.0, queries=len(held), right=0, expected_calibration_error=0.0)
 
     monkeypatch.setattr(build, "site_of", noted)
