@@ -9,10 +9,7 @@ from service.confidence import decision
 from service.confidence.decision import Decision, Outcome
 from service.geometry.rigid import transform_from
 from service.localization.agreement import registered
-from service.localization.localizer import Localizer
-from service.maps.reader import MapBundle
 from service.retrieval.prior import Prior
-from service.retrieval.query import Query
 from tests.unit.localization.test_tracker import THRESHOLD, calibration, found, in_range
 
 #: The frame before the reference is 2 m behind it.
@@ -20,14 +17,7 @@ BEHIND = transform_from(np.eye(3), np.array([0.0, 0.0, -2.0]))
 
 
 @pytest.fixture(scope="module")
-def localizer(bundle_path):
-    return Localizer.open(MapBundle.open(bundle_path))
-
-
-@pytest.fixture(scope="module")
-def frames(localizer, pictures):
-    rgb, depth_m, camera = pictures
-    frame = localizer.encode_and_search(Query(rgb=rgb, depth_m=depth_m, camera=camera))
+def frames(frame):
     return (frame, replace(frame, T_reference_camera=BEHIND))
 
 

@@ -19,10 +19,8 @@ from service.localization.localizer import Localizer
 from service.localization.track_bytes import MOST_BYTES, packed, unpacked
 from service.localization.tracker import MOST_FRAMES, Track, follow
 from service.maps.calibration import AdditiveModel, Calibration, FeatureStatistics, Threshold
-from service.maps.reader import MapBundle
 from service.registration.register import Registered
 from service.retrieval.prior import Prior
-from service.retrieval.query import Query
 from service.retrieval.retrieve import EncodedFrame, Retrieved
 from service.scoring.candidates import Candidate, Refined
 from service.scoring.confirmation import Confirmation
@@ -90,17 +88,6 @@ class Scripted(Localizer):
             candidates=what.refined.candidates,
             frames=len(frames),
         )
-
-
-@pytest.fixture(scope="module")
-def localizer(bundle_path):
-    return Localizer.open(MapBundle.open(bundle_path))
-
-
-@pytest.fixture(scope="module")
-def frame(localizer, pictures):
-    rgb, depth_m, camera = pictures
-    return localizer.encode_and_search(Query(rgb=rgb, depth_m=depth_m, camera=camera))
 
 
 @pytest.fixture
