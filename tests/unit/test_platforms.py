@@ -7,6 +7,7 @@ import tomllib
 from pathlib import Path
 
 import pytest
+from packaging.requirements import Requirement
 
 from service import platforms
 from service.errors import UnsupportedPlatformError
@@ -67,3 +68,10 @@ def test_the_packages_metadata_names_the_same_systems():
     told = {each.rpartition(" :: ")[2] for each in project["classifiers"] if each.startswith("Operating System")}
     assert told == {"Linux", "MacOS"}
     assert {system for system, _ in platforms.SUPPORTED} == {"linux", "darwin"}
+
+
+def test_a_plain_installation_gets_a_numpy_that_jaxtyping_can_read():
+    wanted = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["dependencies"]
+    (numpy,) = (each for each in map(Requirement, wanted) if each.name == "numpy")
+    assert numpy.specifier.contains("2.4.6")
+    assert not numpy.specifier.contains("2.5.0")  # its NDArray is a type alias, and jaxtyping 0.3.11 raises TypeError
