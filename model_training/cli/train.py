@@ -30,7 +30,8 @@ def command(
         str,
         typer.Option(
             help="stock: many cities. matched: some of them, and cities with stereo-matched depth. rigs: as matched, and "
-            "cities that random rigs ask, from a small robot to a lorry. paper: the paper's city itself."
+            "cities that random rigs ask, from a small robot to a lorry. streets: many small cities, for a GPU. paper: the paper's "
+            "city itself."
         ),
     ] = "stock",
     cities: Annotated[

@@ -43,6 +43,11 @@ class Augmentation(BaseModel):
         no_brightness: probability per query view without brightness.
         shading: strength of the smooth and the independent error of the image's grey level, natural logarithm.
         height_error_m: standard deviation of the camera's height, metres.
+        matched_noise_px: greatest standard deviation of further disparity noise where depth comes from stereo matching, pixels at 80 px m.
+        matched_offset_px: standard deviation of a further disparity offset of such a view, pixels at 80 px m.
+        matched_scale_error: standard deviation of the relative error of its depth scale.
+        matched_unchanged: probability per view of neither noise nor offset.
+        matched_holes: least and greatest threshold of a view, standard deviations. A smooth random field above it makes a hole.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
@@ -68,6 +73,11 @@ class Augmentation(BaseModel):
     no_brightness: float = 0.2
     shading: float = 0.3
     height_error_m: float = 0.08
+    matched_noise_px: float = 0.25
+    matched_offset_px: float = 0.075
+    matched_scale_error: float = 0.01
+    matched_unchanged: float = 0.3
+    matched_holes: tuple[float, float] = (1.2, 2.4)
 
 
 class Augmenter:
@@ -162,12 +172,14 @@ class Augmenter:
             height_m: height of the cameras above the ground (B), metres.
             rows_seen: rows that the survey covers (B, rows, 1).
             seen: cells that the camera looks at (B, rows, columns). Give it if the depth already has errors from stereo
-                matching. Then no stereo errors are drawn.
+                matching. Then only the small errors of ``matched_*`` are drawn.
 
         Returns:
             Planes (B, 6, rows, columns) in the order of ``service.imaging.view_grid.PLANES``.
         """
         s, count = self.settings, len(ranges)
+        if seen is not None:
+            ranges = self._matched_again(ranges)
         blocked = ranges
         blocked = self._block(blocked, height_m, self._chance(count, s.blocked), 0.12, s.widest_block)
         blocked = self._block(blocked, height_m, self._chance(count, s.small_blocks), 0.03, 0.2)
@@ -226,6 +238,21 @@ class Augmenter:
         measured = measured.index_copy(0, made, measured[made] | region)
         measured = measured & (self._field(count, 8, 24) < 2.2 - 1.6 * self._uniform(count, 1, 1))
         return seen, measured
+
+    def _matched_again(self, ranges: Tensor) -> Tensor:
+        """Add a little noise, an offset and holes to stereo-matched depth, so that the network cannot learn its views by heart."""
+        s, count = self.settings, len(ranges)
+        z = ranges * self.z_of_range
+        sigma = s.matched_noise_px * self._uniform(count, 1, 1) ** 2
+        noise = self._field(count, 4, 12) + 0.5 * self._field(count, 12, 40)
+        shift = sigma * noise + s.matched_offset_px * self._normal(count, 1, 1)
+        scale = 1 + s.matched_scale_error * self._normal(count, 1, 1)
+        changed = self._uniform(count, 1, 1) >= s.matched_unchanged
+        disparity = FOCAL_BASELINE_PX_M / z.clamp(min=0.3) * scale + shift * changed
+        again = FOCAL_BASELINE_PX_M / disparity.clamp(min=0.5) / self.z_of_range
+        low, high = s.matched_holes
+        lost = self._field(count, 8, 24) > low + (high - low) * self._uniform(count, 1, 1)
+        return torch.where((ranges > 0) & ~lost, again, torch.zeros_like(ranges))
 
     def _block(self, ranges: Tensor, height_m: Tensor, happens: Tensor, narrowest: float, widest: float) -> Tensor:
         """Add the side of a vehicle: an upright plane at 2.5 to 8.5 m, 1.3 to 4 m high, over a share of the columns."""

@@ -150,6 +150,54 @@ def rig_plans() -> list[PackPlan]:
     ]
 
 
+#: Index of the first seeds of ``street_plans``: low and high cameras with modelled depth, rigs of a car, random rigs.
+_LOW_AND_HIGH_FROM, _CARS_FROM, _RANDOM_FROM = 200, 300, 400
+#: Cities of each kind in ``street_plans``; the first ones are cities of the stock recipe.
+_STREETS = {"stock": 11, "low_and_high": 8, "cars": 21, "random": 20}
+#: Places of a city with stereo-matched depth. Small packs are ready soon, so a training sees many cities.
+_STREET_PLACES = 480
+_CAR_LIDARS = ("hdl_64", "hdl_64", "hdl_32", "hdl_64", "os1_64")
+
+
+def street_plans() -> list[PackPlan]:
+    """Plan many small cities, three of four with suburbs and hedges: the training on a GPU (decision 0171)."""
+    stock = [replace(plan, places=1056) for plan in stock_plans(_STREETS["stock"])]
+    low_and_high = [
+        replace(plan, places=2 * _STREET_PLACES, queries_a_place=2)
+        for plan in _surveyed(_LOW_AND_HIGH_FROM, _STREETS["low_and_high"])
+    ]
+    cars = [
+        PackPlan(
+            seed=TRAINING_SEEDS[_CARS_FROM + k],
+            name="mixed" if k % 5 else "city",
+            places=_STREET_PLACES,
+            queries_a_place=1,
+            lidar=_CAR_LIDARS[k % len(_CAR_LIDARS)],
+            lidar_height_m=1.73,
+            rigs=(MATCHED_RIGS[0], MATCHED_RIGS[2], MATCHED_RIGS[0], MATCHED_RIGS[1 if k % 2 else 3]),
+        )
+        for k in range(_STREETS["cars"])
+    ]
+    surveyed = _surveyed(_RANDOM_FROM, _STREETS["random"])
+    return stock + low_and_high + cars + [replace(plan, rigs=random_rigs(plan.seed, 16)) for plan in surveyed]
+
+
+def _surveyed(first: int, cities: int) -> list[PackPlan]:
+    """Plan cities whose LiDAR, its height and the kind of city follow ``_SURVEYS``."""
+    return [
+        PackPlan(
+            seed=TRAINING_SEEDS[first + k],
+            name=kind,
+            places=_STREET_PLACES,
+            queries_a_place=1,
+            lidar=lidar,
+            lidar_height_m=height_m,
+            camera_height_m=HEIGHT_M,
+        )
+        for k, (lidar, height_m, kind) in enumerate(islice(cycle(_SURVEYS), cities))
+    ]
+
+
 def watch_plans() -> list[PackPlan]:
     """Plan the validation city of the training."""
     return [PackPlan(seed=WATCH_SEEDS[0], places=900, queries_a_place=1)]
@@ -165,5 +213,6 @@ RECIPES: dict[str, Callable[[int], list[PackPlan]]] = {
     "stock": stock_plans,
     "matched": lambda _: [*stock_plans(_CLEAN_BESIDE), *matched_plans()],
     "rigs": lambda _: [*stock_plans(_CLEAN_BESIDE), *matched_plans(_CAR_BESIDE), *rig_plans()],
+    "streets": lambda _: street_plans(),
     "paper": lambda _: paper_plans(),
 }

@@ -30,6 +30,10 @@ NOTHING = Augmentation(
     intensity_gain=0,
     no_brightness=0,
     shading=0,
+    matched_noise_px=0,
+    matched_offset_px=0,
+    matched_scale_error=0,
+    matched_holes=(99.0, 99.0),
 )
 
 
@@ -217,6 +221,38 @@ def test_stereo_matched_depth_gets_no_modelled_errors():
     torch.testing.assert_close(plane(planes, "range_m"), ranges, rtol=1e-6, atol=0)
     drawn = plane(augmenter(**noisy).query(ranges, rgb, height, rows), "range_m")
     assert ((drawn - ranges).abs() > 0.1).any()
+
+
+def matched_ranges(range_m=10.0, **changed):
+    """Range of one cell of each view, next to the optical axis, where z and range are nearly the same."""
+    ranges, rgb, height, rows = clean(range_m=range_m)
+    seen = torch.ones_like(ranges, dtype=torch.bool)
+    return plane(augmenter(**changed).query(ranges, rgb, height, rows, seen=seen), "range_m")[:, 16, 64]
+
+
+def test_an_offset_of_matched_depth_shifts_the_disparity_of_a_whole_view():
+    """At 10 m the disparity is 8 px, so 0.4 px (two of three views within one standard deviation) is 0.5 m."""
+    shifted = (80 / matched_ranges(matched_offset_px=0.4, matched_unchanged=0.0)) - 8
+    assert float(shifted.std()) == pytest.approx(0.4, rel=0.15)
+    same = matched_ranges(matched_offset_px=0.4, matched_unchanged=1.0)
+    torch.testing.assert_close(same, torch.full_like(same, 10.0), rtol=1e-5, atol=0)
+
+
+def test_the_noise_of_matched_depth_stays_below_its_greatest_size():
+    errors = (80 / matched_ranges(matched_noise_px=0.3, matched_unchanged=0.0)) - 8
+    assert 0.02 < float(errors.std()) < 0.3
+
+
+def test_holes_of_matched_depth_are_where_a_smooth_field_exceeds_the_threshold():
+    lost = matched_ranges(matched_holes=(0.0, 0.0)) == 0
+    assert float(lost.float().mean()) == pytest.approx(0.5, abs=0.1)
+    assert not (matched_ranges(matched_holes=(99.0, 99.0)) == 0).any()
+
+
+def test_a_scale_error_of_matched_depth_is_relative():
+    far, near = (matched_ranges(range_m, matched_scale_error=0.02) / range_m for range_m in (20.0, 5.0))
+    assert float(far.std()) == pytest.approx(0.02, rel=0.15)
+    assert float(near.std()) == pytest.approx(0.02, rel=0.15)
 
 
 def test_cells_outside_the_field_of_view_are_not_observed():

@@ -28,6 +28,7 @@ from model_training.training.recipe import (
     paper_plans,
     rig_plans,
     stock_plans,
+    street_plans,
     watch_plans,
 )
 from service.errors import DatasetError
@@ -148,6 +149,17 @@ def test_cities_of_random_rigs_are_cities_of_their_own():
     assert set(rig_plans()) <= set(RECIPES["rigs"](1))
     assert {bool(plan.rigs) for plan in plans} == {True, False}
     assert all(plan.camera_height_m == HEIGHT_M for plan in plans)
+
+
+def test_the_recipe_of_many_small_cities_has_seeds_of_its_own_except_those_of_the_stock_recipe():
+    plans = street_plans()
+    stock = {plan.seed for plan in stock_plans(STOCK_CITIES)}
+    earlier = stock | {plan.seed for plan in [*matched_plans(20), *rig_plans()]}
+    assert len({plan.seed for plan in plans}) == len(plans) == 60
+    assert {plan.seed for plan in plans} <= set(TRAINING_SEEDS)
+    assert {plan.seed for plan in plans} & earlier <= stock
+    assert sum(bool(plan.rigs) for plan in plans) == 41
+    assert RECIPES["streets"](1) == plans
 
 
 def test_random_rigs_cover_the_range_and_no_two_are_the_same():
