@@ -18,6 +18,7 @@ from model_training.datasets.without_streets import WithoutStreets
 from model_training.mapping.build import build_map
 from model_training.mapping.settings import BuildSettings
 from model_training.simulation.depth_noise import DEPTHS
+from model_training.simulation.plan import SimulationPlan
 from model_training.simulation.simulate import simulate
 from service.localization.localizer import Localizer
 from service.maps.calibration import Calibration
@@ -79,16 +80,15 @@ def collected(work: Path, encoder: Path, *, anew: bool = False, report: Report =
         EncoderError: the encoder cannot be used.
     """
     families = [_asked_family(work, encoder, family, anew=anew, report=report) for family in FAMILIES]
-    cities = []
-    for index in range(CITIES):
-        plan = calibration_plan(index)
-        simulate(plan, work / plan.name, report=report)
-        cities.append(Dataset(work / plan.name))
-    parts = [_asked(work, encoder, cities, k, anew=anew, report=report) for k in range(CITIES)]
-    street = repeating_plan()
-    simulate(street, work / street.name, report=report)
-    alike = _asked_repeating(work, encoder, Dataset(work / street.name), anew=anew, report=report)
+    parts = [_asked(work, encoder, k, anew=anew, report=report) for k in range(CITIES)]
+    alike = _asked_repeating(work, encoder, anew=anew, report=report)
     return pooled([*parts, *families, alike])
+
+
+def _city(work: Path, plan: SimulationPlan, report: Report) -> Dataset:
+    """Simulate a city, or open it if an earlier run has finished it."""
+    simulate(plan, work / plan.name, report=report)
+    return Dataset(work / plan.name)
 
 
 def _localizer(work: Path, encoder: Path, dataset: Dataset, name: str, report: Report) -> Localizer:
@@ -99,24 +99,21 @@ def _localizer(work: Path, encoder: Path, dataset: Dataset, name: str, report: R
     return Localizer.open(MapBundle.open(folder))
 
 
-def _asked(work: Path, encoder: Path, cities: list[Dataset], index: int, *, anew: bool, report: Report) -> Asked:
+def _asked(work: Path, encoder: Path, index: int, *, anew: bool, report: Report) -> Asked:
     """Return the calibration data of one city.
 
     Its queries are localized in its own map, in the map of the other city, and in its own map without a third of the streets. Walls and
     rooms are added.
     """
-    return _kept(work, encoder, cities[index], lambda: _ask(work, encoder, cities, index, report), anew=anew)
+    return _kept(work, encoder, calibration_plan(index), lambda: _ask(work, encoder, index, report), anew=anew)
 
 
 def _asked_family(work: Path, encoder: Path, family: Family, *, anew: bool, report: Report) -> Asked:
     """Return the calibration data of a rig family: queries of its cities in their own and each other's maps, and walls and rooms."""
-    cities = []
-    for index in range(FAMILY_CITIES):
-        plan = family_plan(family, index)
-        simulate(plan, work / plan.name, report=report)
-        cities.append(Dataset(work / plan.name))
+    plans = [family_plan(family, index) for index in range(FAMILY_CITIES)]
 
     def ask() -> list[Asked]:
+        cities = [_city(work, plan, report) for plan in plans]
         found = []
         of_rig = Rig(family.name, beams_deg=family.beams, cameras=family.cameras)
         for index, own in enumerate(cities):
@@ -130,23 +127,29 @@ def _asked_family(work: Path, encoder: Path, family: Family, *, anew: bool, repo
         )  # fmt: skip
         return [each.of_family(family.name) for each in found]
 
-    return _kept(work, encoder, cities[0], ask, anew=anew)
+    return _kept(work, encoder, plans[0], ask, anew=anew)
 
 
-def _asked_repeating(work: Path, encoder: Path, street: Dataset, *, anew: bool, report: Report) -> Asked:
+def _asked_repeating(work: Path, encoder: Path, *, anew: bool, report: Report) -> Asked:
     """Return the calibration data of a street with repeating blocks, where wrong places look right: single queries and sequences."""
+    plan = repeating_plan()
 
     def ask() -> list[Asked]:
+        street = _city(work, plan, report)
         found = in_the_map(_localizer(work, encoder, street, street.name, report), street, report)
         return [each.of_family("repeating") for each in found]
 
-    return _kept(work, encoder, street, ask, anew=anew)
+    return _kept(work, encoder, plan, ask, anew=anew)
 
 
-def _kept(work: Path, encoder: Path, city: Dataset, ask: Callable[[], list[Asked]], *, anew: bool) -> Asked:
-    """Return the stored calibration data of an earlier run, or compute and store them."""
-    kept = work / f"asked-{city.name}-{Encoder.open(encoder).sha256[:12]}.npz"
+def _kept(work: Path, encoder: Path, plan: SimulationPlan, ask: Callable[[], list[Asked]], *, anew: bool) -> Asked:
+    """Return the calibration data that an earlier run stored under the name of a plan, or compute and store them.
+
+    Stored data need no city and no map. So the fit can be repeated in a minute where only the answers are.
+    """
+    kept = work / f"asked-{plan.name}-{Encoder.open(encoder).sha256[:12]}.npz"
     if not kept.exists() or anew:
+        work.mkdir(parents=True, exist_ok=True)
         asked, part = pooled(ask()), kept.with_suffix(".part.npz")
         np.savez_compressed(part, **{name: getattr(asked, name) for name in Asked.__dataclass_fields__})
         part.rename(kept)
@@ -158,7 +161,8 @@ def _kept(work: Path, encoder: Path, city: Dataset, ask: Callable[[], list[Asked
     return read_arrays(kept, read, remedy="remove it, and the command sends its queries again")
 
 
-def _ask(work: Path, encoder: Path, cities: list[Dataset], index: int, report: Report) -> list[Asked]:
+def _ask(work: Path, encoder: Path, index: int, report: Report) -> list[Asked]:
+    cities = [_city(work, calibration_plan(k), report) for k in range(CITIES)]
     own, other = cities[index], cities[(index + 1) % len(cities)]
     partial = WithoutStreets(own.folder)
     here = _localizer(work, encoder, own, own.name, report)

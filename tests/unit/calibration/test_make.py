@@ -1,5 +1,5 @@
+import shutil
 from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -54,7 +54,13 @@ class Work:
 
     def __init__(self, monkeypatch, folder, encoder):
         self.folder, self.encoder, self.built, self.asked = folder, encoder, [], []
-        self.cities = [_dataset(name, folder) for name in ("one", "two", "three")]
+        self.simulated = []
+        monkeypatch.setattr(make, "CITIES", 3)
+        monkeypatch.setattr(
+            make, "calibration_plan", lambda index: SimpleNamespace(name=("one", "two", "three")[index], seed=index)
+        )
+        monkeypatch.setattr(make, "simulate", lambda plan, *_, **__: self.simulated.append(plan.name))
+        monkeypatch.setattr(make, "Dataset", lambda folder: _dataset(folder.name, folder.parent))
         monkeypatch.setattr(make, "WithoutStreets", self.without_streets)
         monkeypatch.setattr(make, "build_map", self.build_map)
         monkeypatch.setattr(make, "MapBundle", SimpleNamespace(open=lambda folder: folder.name.rsplit("-", 1)[0]))
@@ -93,7 +99,7 @@ class Work:
         return [city(len(self.asked), count=10)]
 
     def all_of(self, index, *, anew=False):
-        return make._asked(self.folder, self.encoder, self.cities, index, anew=anew, report=print)
+        return make._asked(self.folder, self.encoder, index, anew=anew, report=print)
 
 
 @pytest.fixture
@@ -124,18 +130,16 @@ def test_the_queries_of_a_city_are_localized_in_its_own_map_the_other_one_and_wi
     ]
 
 
-def test_repeating_blocks_are_asked_of_their_own_map_and_kept(work):
-    street: Any = SimpleNamespace(name="blocks", folder=work.folder / "blocks")
-    first = make._asked_repeating(work.folder, work.encoder, street, anew=False, report=print)
-    again = make._asked_repeating(work.folder, work.encoder, street, anew=False, report=print)
+def test_repeating_blocks_are_asked_of_their_own_map_and_kept(work, monkeypatch):
+    monkeypatch.setattr(make, "repeating_plan", lambda: SimpleNamespace(name="blocks"))
+    first = make._asked_repeating(work.folder, work.encoder, anew=False, report=print)
+    again = make._asked_repeating(work.folder, work.encoder, anew=False, report=print)
     assert work.asked == [("in_the_map", "blocks", "blocks", ())]
     assert work.built == [("blocks", False, "blocks", 1.0)]
     np.testing.assert_array_equal(first.evidence, again.evidence)
 
 
-def test_a_family_localizes_the_queries_of_its_cities_in_both_maps(work, monkeypatch):
-    monkeypatch.setattr(make, "simulate", lambda *_, **__: None)
-    monkeypatch.setattr(make, "Dataset", lambda folder: _dataset(folder.name, folder.parent))
+def test_a_family_localizes_the_queries_of_its_cities_in_both_maps(work):
     car = FAMILIES[0]
     found = make._asked_family(work.folder, work.encoder, car, anew=False, report=print)
     one, two = "calibration-car-1", "calibration-car-2"
@@ -149,6 +153,20 @@ def test_a_family_localizes_the_queries_of_its_cities_in_both_maps(work, monkeyp
     assert len(found) == 50
     assert set(found.family.tolist()) == {"car"}
     assert {name for name, *_ in work.built} == {one, two}
+
+
+def test_stored_answers_need_neither_cities_nor_maps(work, tmp_path):
+    """The answers alone are enough to repeat the fit."""
+    first = make.collected(work.folder, work.encoder, report=print)
+    simulated, built, other = len(work.simulated), len(work.built), tmp_path / "answers"
+    assert simulated > 0
+    other.mkdir()
+    for kept in work.folder.glob("asked-*.npz"):
+        shutil.copy(kept, other)
+    again = make.collected(other, work.encoder, report=print)
+    np.testing.assert_array_equal(again.evidence, first.evidence)
+    assert (len(work.simulated), len(work.built)) == (simulated, built)
+    assert {path.suffix for path in other.iterdir()} == {".npz"}
 
 
 def test_the_last_city_is_asked_of_the_first_ones_maps(work):
