@@ -1,6 +1,8 @@
 """Ray casting with Embree. Embree computes in float32, so coordinates must stay near the city's origin."""
 
+import os
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 from embreex import rtcore_scene
@@ -44,6 +46,7 @@ class Scene:
     """
 
     def __init__(self, mesh: Mesh) -> None:
+        _keep_embree_in_the_calling_thread()
         self.mesh = mesh
         self._scene = rtcore_scene.EmbreeScene()
         TriangleMesh(self._scene, mesh.triangles)
@@ -85,3 +88,25 @@ class Scene:
         blocked = self._scene.run(np.ascontiguousarray(points), rays, query="OCCLUDED")
         free: NDArray[np.bool_] = np.asarray(blocked) < 0
         return free
+
+
+@cache
+def _keep_embree_in_the_calling_thread() -> None:
+    """Make Embree build all scenes of this process in the calling thread, on systems where a process can choose its processors.
+
+    Workers of the simulator are forked, so that they share the scene. At that moment a thread of Embree's TBB may hold a lock. In the
+    worker this thread does not exist, so the lock stays closed, and the worker waits for ever when it builds a scene itself. TBB takes
+    the number of its threads once, from the processors that the process may use.
+    """
+    if not hasattr(os, "sched_setaffinity"):
+        return
+    process = os.getpid()
+    allowed = os.sched_getaffinity(process)
+    os.sched_setaffinity(process, {min(allowed)})
+    try:
+        triangle = np.array([[[0, 0, 0], [1, 0, 0], [0, 1, 0]]], np.float32)
+        scene = rtcore_scene.EmbreeScene()
+        TriangleMesh(scene, triangle)
+        scene.run(np.zeros((1, 3), np.float32), np.ones((1, 3), np.float32))  # the first ray builds the scene
+    finally:
+        os.sched_setaffinity(process, allowed)

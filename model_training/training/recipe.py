@@ -160,7 +160,7 @@ _CAR_LIDARS = ("hdl_64", "hdl_64", "hdl_32", "hdl_64", "os1_64")
 
 
 def street_plans() -> list[PackPlan]:
-    """Plan many small cities, three of four with suburbs and hedges: the training on a GPU (decision 0171)."""
+    """Plan 60 small cities, more than half with suburbs and hedges: the training on a GPU (decision 0171)."""
     stock = [replace(plan, places=1056) for plan in stock_plans(_STREETS["stock"])]
     low_and_high = [
         replace(plan, places=2 * _STREET_PLACES, queries_a_place=2)
