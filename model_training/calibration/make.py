@@ -145,7 +145,7 @@ def _asked_repeating(work: Path, encoder: Path, *, anew: bool, report: Report) -
 def _kept(work: Path, encoder: Path, plan: SimulationPlan, ask: Callable[[], list[Asked]], *, anew: bool) -> Asked:
     """Return the calibration data that an earlier run stored under the name of a plan, or compute and store them.
 
-    Stored data need no city and no map. So the fit can be repeated in a minute where only the answers are.
+    Stored data need no city and no map. So the fit can be repeated where only the answers are.
     """
     kept = work / f"asked-{plan.name}-{Encoder.open(encoder).sha256[:12]}.npz"
     if not kept.exists() or anew:
