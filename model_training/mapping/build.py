@@ -128,7 +128,6 @@ def write_from(
     trim()
     stages.report("writing", 0, 2)
     content = with_cloud(content, cloud)
-    del cloud  # the content has all that the bundle needs
     stages.report("writing", 1, 2)
     manifest = write_bundle(out, content, overwrite=overwrite)
     stages.report("writing", 2, 2)

@@ -11,6 +11,7 @@ from service.geometry.lengths import lengths
 from service.geometry.rigid import transform_points
 from service.heap import trim
 from service.maps.content import BundleContent
+from service.registration.kernel import SURFEL
 from service.registration.surfel_map import SurfelMap
 
 #: Largest range of a point in the cloud, metres.
@@ -43,19 +44,17 @@ def prepared(cloud: VoxelMap) -> SurfelMap | None:
 
 
 def with_cloud(content: BundleContent, cloud: VoxelMap) -> BundleContent:
-    """Return the map with a cloud, the voxel sums for merging, and the preview image.
+    """Return the map with a cloud, the voxel sums for merging, and the preview image. ``cloud`` must not change until it is written.
 
     Args:
         content: the map. Its own cloud, sums and preview are replaced.
         cloud: the voxel map of the cloud.
     """
-    preview = _preview(cloud, content.T_map_place[:, :3, 3])
     surfel_map = prepared(cloud)
-    statistics = None if surfel_map is None else cloud.statistics()
-    return replace(content, cloud=surfel_map, statistics=statistics, preview_webp=preview)
-
-
-def _preview(cloud: VoxelMap, track: NDArray[np.float64]) -> bytes:
-    # Its own surfels, in a hundredth of the time of a build. To keep them for the grid would take the most memory of the build.
-    found = cloud.surfels()
-    return preview_webp(found.positions, found.normals, track)
+    surfels = np.zeros(0, SURFEL) if surfel_map is None else surfel_map.surfels
+    return replace(
+        content,
+        cloud=surfel_map,
+        statistics=None if surfel_map is None else cloud.columns(),
+        preview_webp=preview_webp(surfels, cloud.origin, content.T_map_place[:, :3, 3]),
+    )

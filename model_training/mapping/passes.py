@@ -28,7 +28,7 @@ from model_training.datasets.dataset import Dataset
 from model_training.mapping.settings import BuildSettings
 from model_training.mapping.survey import clear_scan, travelled_m
 from model_training.mapping.tiles import TilePart
-from model_training.mapping.voxel_map import VoxelMap
+from model_training.mapping.voxel_map import MOMENTS, SPAN, VoxelMap, ranked
 from model_training.mapping.work import Arrays
 from service.compiled import load
 from service.geometry.lengths import lengths
@@ -50,16 +50,17 @@ _ROWS, _COLUMNS = 180, 720
 #: Points nearer than this lie on the vehicle, metres.
 _NEAREST_M = 2.0
 #: Number of tiles along an axis that have a number of their own.
-_SPAN = 1 << 24
+_TILE_SPAN = 1 << 24
 
 
 @cache
 def _library() -> ctypes.CDLL:
     arguments: list[Any] = [
-        c_void_p, c_int64, c_void_p, c_void_p, c_void_p, c_int64,
+        c_void_p, c_int64, c_void_p, c_void_p, c_void_p, c_void_p, c_void_p, c_int64,
         c_void_p, c_void_p, c_void_p, c_void_p, c_void_p, c_void_p,
     ]  # fmt: skip
-    library = load(LIBRARY, constants={"ROWS": _ROWS, "COLUMNS": _COLUMNS, "ARGUMENTS": len(arguments)})
+    image, voxels = {"ROWS": _ROWS, "COLUMNS": _COLUMNS}, {"MOMENTS": MOMENTS, "SPAN": SPAN}
+    library = load(LIBRARY, constants={**image, **voxels, "ARGUMENTS": len(arguments)})
     library.streetfix_looked_through.argtypes = arguments
     library.streetfix_looked_through.restype = c_int64
     return library
@@ -143,52 +144,90 @@ def tile_of(positions: NDArray[np.float64]) -> NDArray[np.int64]:
 
 
 def _numbered(tiles: NDArray[np.int64]) -> NDArray[np.int64]:
-    return np.asarray((tiles[..., 0] + _SPAN // 2) * _SPAN + tiles[..., 1] + _SPAN // 2)
+    return np.asarray((tiles[..., 0] + _TILE_SPAN // 2) * _TILE_SPAN + tiles[..., 1] + _TILE_SPAN // 2)
 
 
 @dataclass(frozen=True, eq=False)
 class Targets:
-    """The voxels of a vote, with an index by tile.
+    """The voxels of a vote: those with a surface. A large map has millions of voxels, so each takes few bytes.
 
     Attributes:
-        keys: keys of the voxels in the order of ``VoxelMap.sums``, ascending (n,).
-        positions: positions of their surfels, metres, map frame (n, 3).
-        normals: unit normals of their surfels, map frame (n, 3).
-        tile: number of the tile of each voxel (n,).
-        by_tile: indices of the voxels, sorted by tile (n,).
-        voxel_m: edge of a voxel, metres.
+        cloud: the voxel map. Voxels are named by their rows in ``VoxelMap.sums``. It must not change during the vote.
+        has_surface: True for the voxels of the vote (N,).
+        normals: unit normals of the surfaces, map frame; not set for other voxels (N, 3).
+        numbers: numbers of the tiles that have voxels of the vote, ascending, as from ``tile_of`` (T,).
+        tile: index of each voxel's tile in ``numbers``; not set for other voxels (N,).
+        by_tile: rows of the voxels of the vote, sorted by tile (n,).
+        first: first entry of each tile in ``by_tile`` (T + 1,).
     """
 
-    keys: NDArray[np.int64]
-    positions: NDArray[np.float64]
+    cloud: VoxelMap
+    has_surface: NDArray[np.bool_]
     normals: NDArray[np.float32]
-    tile: NDArray[np.int64]
-    by_tile: NDArray[np.int64]
-    voxel_m: float
+    numbers: NDArray[np.int64]
+    tile: NDArray[np.int32]
+    by_tile: NDArray[np.int32]
+    first: NDArray[np.int64]
 
     @classmethod
     def of(cls, cloud: VoxelMap) -> "Targets":
-        """Select all voxels that have a surfel.
+        """Select all voxels that have a surface.
 
         Args:
             cloud: the voxel map.
         """
-        surfels = cloud.surfels()
-        tile = tile_of(surfels.positions)
-        return cls(
-            surfels.keys, surfels.positions, surfels.normals, tile, np.argsort(tile, kind="stable"), cloud.voxel_m
-        )
+        surfaces = cloud.surfaces()
+        return cls.at(cloud, surfaces.rows, surfaces.normals)
 
-    def of_tiles(self, tiles: NDArray[np.int64]) -> NDArray[np.int64]:
-        """Return the indices of the voxels in some tiles (m,).
+    @classmethod
+    def at(cls, cloud: VoxelMap, rows: NDArray[np.int32], normals: NDArray[np.float32]) -> "Targets":
+        """Make the index by tile.
 
         Args:
-            tiles: numbers of the tiles (K,).
+            cloud: the voxel map, with N voxels.
+            rows: rows of the voxels of the vote, ascending (n,).
+            normals: unit normals, map frame (N, 3).
         """
-        first = np.searchsorted(self.tile, tiles, side="left", sorter=self.by_tile)
-        last = np.searchsorted(self.tile, tiles, side="right", sorter=self.by_tile)
-        ranges = [self.by_tile[a:b] for a, b in zip(first, last, strict=True)]
-        return np.concatenate(ranges) if ranges else np.zeros(0, np.int64)
+        numbers, of_row = ranked(len(rows), lambda part: tile_of(cloud.means_of(rows[part])))
+        order = np.argsort(of_row, kind="stable")
+        first = np.searchsorted(of_row, np.arange(len(numbers) + 1), sorter=order)
+        has_surface, tile = np.zeros(len(normals), np.bool_), np.empty(len(normals), np.int32)
+        has_surface[rows], tile[rows] = True, of_row
+        return cls(cloud, has_surface, normals, numbers, tile, rows[order], first)
+
+    def of_tiles(self, numbers: NDArray[np.int64]) -> NDArray[np.int32]:
+        """Return the rows of the voxels in some tiles (m,).
+
+        Args:
+            numbers: numbers of the tiles (K,).
+        """
+        found = _positions_in(self.numbers, numbers)
+        ranges = [self.by_tile[self.first[k] : self.first[k + 1]] for k in found]
+        return np.concatenate(ranges) if ranges else np.zeros(0, np.int32)
+
+    def with_keys(self, keys: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Return the rows of the voxels that have some keys (m,). Keys of other voxels are ignored.
+
+        Args:
+            keys: keys (k,).
+        """
+        rows = _positions_in(self.cloud.sums()[0], keys)
+        return np.asarray(rows[self.has_surface[rows]])
+
+    def numbers_of(self, rows: NDArray[np.integer[Any]]) -> NDArray[np.int64]:
+        """Return the number of the tile of some voxels (m,).
+
+        Args:
+            rows: rows of the voxels (m,).
+        """
+        return self.numbers[self.tile[rows]]
+
+
+def _positions_in(ascending: NDArray[np.int64], values: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Return the positions of those values that an ascending array contains (m,)."""
+    at = np.searchsorted(ascending, values)
+    inside = at < len(ascending)
+    return np.asarray(at[inside][ascending[at[inside]] == values[inside]])
 
 
 @dataclass(frozen=True, eq=False)
@@ -254,23 +293,20 @@ class Vote:
             report: called after every scan with its row plus one.
 
         Returns:
-            ``of``: indices of the voxels that are hit or seen through (m,). ``hit`` and ``through``: a bit for each pass (m,).
+            ``of``: rows of the voxels that are hit or seen through (m,). ``hit`` and ``through``: a bit for each pass (m,).
         """
         targets, passes = self.targets, self.passes
         # Behind the voxel a ray must end farther away than this to see through it. Scans of one traversal agree better than passes.
         behind_m = (1 if self.each_scan else 2) * self.cloud.voxel_m
-        hit, through = np.zeros(len(targets.keys), np.uint64), np.zeros(len(targets.keys), np.uint64)
+        hit, through = np.zeros((2, len(targets.normals)), np.uint64)
         for scan in scans:
             T = self.T_map_lidar[scan]
             points = clear_scan(self.dataset, int(self.numbers[scan]), self.settings)[:, :3].astype(np.float64)
             near = points[lengths(points) <= REACH_M]
-            touched = np.unique(self.cloud.keys_of(transform_points(T, near)))
-            at = np.searchsorted(targets.keys, touched)
-            inside = at < len(targets.keys)
-            at = at[inside][targets.keys[at[inside]] == touched[inside]]
-            hit[at] |= passes.bits(scan, targets.tile[at])
+            at = targets.with_keys(np.unique(self.cloud.keys_of(transform_points(T, near))))
+            hit[at] |= passes.bits(scan, targets.numbers_of(at))
             seen = looked_through(targets, targets.of_tiles(passes.tiles[scan]), points, T, behind_m=behind_m)
-            through[seen] |= passes.bits(scan, targets.tile[seen])
+            through[seen] |= passes.bits(scan, targets.numbers_of(seen))
             report(scan + 1)
         of = np.flatnonzero(hit | through)
         return {"of": of, "hit": hit[of], "through": through[of]}
@@ -285,28 +321,28 @@ class Vote:
             votes: the votes of all scans, as ``votes`` returns them.
             earlier: keys of the voxels that were in the map before this survey (k,). The map counts as one more pass that hit them.
         """
-        keys = self.targets.keys
-        hit, through = np.zeros(len(keys), np.uint64), np.zeros(len(keys), np.uint64)
+        keys, _ = self.cloud.sums()
+        hit, through = np.zeros((2, len(keys)), np.uint64)
         for part in votes:
             hit[part["of"]] |= part["hit"]
             through[part["of"]] |= part["through"]
-        hits = np.maximum(np.bitwise_count(hit), 1).astype(np.int64)
+        hits = np.maximum(np.bitwise_count(hit), 1)
         if earlier is not None:
             known = np.isin(keys, earlier)
             hits = np.where(known, np.bitwise_count(hit) + 1, hits)
-        against = np.bitwise_count(through & ~hit).astype(np.int64)
+        against = np.bitwise_count(through & ~hit)
         return np.asarray(keys[against >= hits if self.each_scan else against > hits])
 
 
 def looked_through(
     targets: Targets,
-    candidates: NDArray[np.int64],
+    candidates: NDArray[np.int32],
     points: NDArray[np.float64],
     T_map_lidar: NDArray[np.float64],
     *,
     behind_m: float,
-) -> NDArray[np.int64]:
-    """Return the indices of the voxels that a scan sees through (m,).
+) -> NDArray[np.int32]:
+    """Return the rows of the voxels that a scan sees through (m,).
 
     The scan becomes a range image with cells of half a degree, the nearest point in each. The scan sees through a voxel under three
     conditions:
@@ -317,21 +353,24 @@ def looked_through(
 
     Args:
         targets: the voxels.
-        candidates: indices of the voxels to test (k,).
+        candidates: rows of the voxels to test (k,).
         points: points of the scan, metres, LiDAR frame (n, 3).
         T_map_lidar: pose of the scan (4, 4).
         behind_m: smallest distance between the voxel and the end of a ray behind it, metres. One hundredth of the range is added for
             errors of poses and beams.
     """
     points, candidates = np.ascontiguousarray(points), np.ascontiguousarray(candidates)
-    T_lidar_map = np.ascontiguousarray(inverse(T_map_lidar)[:3])
-    limits = np.array([_NEAREST_M, REACH_M, behind_m, targets.voxel_m])
+    keys, moments = targets.cloud.sums()
+    origin, T_lidar_map = np.ascontiguousarray(targets.cloud.origin), np.ascontiguousarray(inverse(T_map_lidar)[:3])
+    limits = np.array([_NEAREST_M, REACH_M, behind_m, targets.cloud.voxel_m])
     point_at, ranges, least = np.empty(_ROWS * _COLUMNS, np.int32), *np.empty((2, _ROWS * _COLUMNS))
-    seen = np.empty(len(candidates), np.int64)
+    seen = np.empty(len(candidates), np.int32)
     count = _library().streetfix_looked_through(
         points.ctypes.data,
         len(points),
-        targets.positions.ctypes.data,
+        keys.ctypes.data,
+        moments.ctypes.data,
+        origin.ctypes.data,
         targets.normals.ctypes.data,
         candidates.ctypes.data,
         len(candidates),

@@ -1,34 +1,43 @@
 """Draw a map from above."""
 
+from typing import Any
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+
+from model_training.mapping.voxel_map import parts
 
 _PAPER = np.array([250, 249, 246], np.float32)
 
 
 def preview_webp(
-    positions: NDArray[np.float64], normals: NDArray[np.float32], track: NDArray[np.float64], *, longest_px: int = 1200
+    surfels: NDArray[Any], origin: NDArray[np.float64], track: NDArray[np.float64], *, longest_px: int = 1200
 ) -> bytes:
     """Draw a WebP image of a map: walls dark, ground light, the track of the survey in colour.
 
     A pixel is the darker, the more vertical surfels it has.
 
     Args:
-        positions: positions of the surfels, metres, map frame (n, 3).
-        normals: unit normals of the surfels, map frame (n, 3).
+        surfels: surfels of the map, (n,) of ``SURFEL``. There may be none.
+        origin: origin of the surfels' frame, metres, map frame (3,).
         track: positions of the places, metres, map frame (P, 3).
         longest_px: length of the longer side of the image, pixels.
     """
-    everything = np.concatenate([positions[:, :2], track[:, :2]])
-    low, high = everything.min(axis=0) - 5, everything.max(axis=0) + 5
+    low, high = track[:, :2].min(axis=0), track[:, :2].max(axis=0)
+    for part in parts(len(surfels)):
+        positions = surfels["xyz"][part, :2] + origin[:2]
+        low, high = np.minimum(low, positions.min(axis=0)), np.maximum(high, positions.max(axis=0))
+    low, high = low - 5, high + 5
     metre = longest_px / max(1.0, float((high - low).max()))
     width, height = (int(x) + 1 for x in (high - low) * metre)
-    pixel = ((positions[:, :2] - low) * metre).astype(int)
-    flat = (height - 1 - pixel[:, 1]) * width + pixel[:, 0]
-    upright = np.abs(normals[:, 2]) < 0.5
-    walls = np.bincount(flat[upright], minlength=width * height).reshape(height, width)
-    ground = np.bincount(flat[~upright], minlength=width * height).reshape(height, width)
+    walls, ground = np.zeros((2, height * width), np.int64)
+    for part in parts(len(surfels)):
+        pixel = ((surfels["xyz"][part, :2] + origin[:2] - low) * metre).astype(int)
+        flat, upright = (height - 1 - pixel[:, 1]) * width + pixel[:, 0], np.abs(surfels["normal"][part, 2]) < 0.5
+        walls += np.bincount(flat[upright], minlength=height * width)
+        ground += np.bincount(flat[~upright], minlength=height * width)
+    walls, ground = walls.reshape(height, width), ground.reshape(height, width)
     dark = np.clip(np.log1p(walls) / np.log(12.0), 0, 1)[..., None].astype(np.float32)
     grey = (ground > 0)[..., None] * np.array([26, 25, 22], np.float32)
     picture = (_PAPER - grey) * (1 - dark) + np.array([52, 44, 40], np.float32) * dark

@@ -1,12 +1,12 @@
 """Accumulate scans in voxels and compute the surfels of the map cloud.
 
 Each voxel stores the moments of its points: count, sum, sum of products, in single precision as in a bundle. So the memory depends on the
-number of voxels, not of points: 56 bytes each, and twice as much while scans are added.
+number of voxels, not of points: 56 bytes each, and half as much again while scans are added.
 The normal of a voxel is the axis of least variance of its moments and those of its 26 neighbours. The neighbours have less weight.
 """
 
 import ctypes
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from ctypes import c_double, c_int64, c_void_p
 from dataclasses import dataclass
 from functools import cache
@@ -18,19 +18,20 @@ from numpy.typing import NDArray
 
 from service.compiled import load
 from service.errors import DatasetError
+from service.maps.byte_planes import Columns
 from service.registration.kernel import SURFEL
 from service.registration.surfel_map import TILE_M
 
 #: Library that the build compiles from ``voxels.c``.
 LIBRARY = Path(__file__).with_name("_voxels.so")
 #: Number of cells along an axis. A key has 3 x 20 bits.
-_SPAN = 1 << 20
+SPAN = 1 << 20
 #: Largest distance of a cell from the origin, in cells, up to which it and its neighbours have unique keys.
-_FARTHEST = _SPAN // 2 - 2
+_FARTHEST = SPAN // 2 - 2
 #: Columns of the second moments.
 _SECOND = slice(4, 10)
 #: Number of columns: count, x, y, z, xx, xy, xz, yy, yz, zz about the voxel's centre; sum of brightness, number of points that have one.
-_MOMENTS, _BRIGHT = 12, slice(10, 12)
+MOMENTS, _BRIGHT = 12, slice(10, 12)
 #: Weight of a neighbour's points in a normal, by the number of axes along which it is displaced. Equal weights smooth the balconies and
 #: recesses of a facade into one slope. Smaller weights (0.1, 0.02, 0.005) follow the noise of the survey (decision 0098).
 _NEIGHBOUR = (1.0, 0.3, 0.1, 0.03)
@@ -40,6 +41,7 @@ FEWEST = 5
 _PART = 1 << 18
 #: Smallest number of waiting rows of sums that starts a merge.
 _WAITING = 1 << 19
+_NO_KEYS, _NO_MOMENTS = np.zeros(0, np.int64), np.zeros((0, MOMENTS), np.float32)
 _Float = TypeVar("_Float", np.float32, np.float64)
 
 #: A voxel as a bundle stores it, for merging maps. ``cell``: its cell; all maps of one edge share one lattice through the zero of the map
@@ -65,7 +67,7 @@ def _library() -> ctypes.CDLL:
         c_void_p,
         c_void_p,
     ]
-    constants = {"MOMENTS": _MOMENTS, "SPAN": _SPAN, "ARGUMENTS": len(arguments), "SUM_ARGUMENTS": len(of_sums)}
+    constants = {"MOMENTS": MOMENTS, "SPAN": SPAN, "ARGUMENTS": len(arguments), "SUM_ARGUMENTS": len(of_sums)}
     library = load(LIBRARY, constants=constants)
     library.streetfix_sums.argtypes = of_sums
     library.streetfix_sums.restype = c_int64
@@ -74,29 +76,23 @@ def _library() -> ctypes.CDLL:
     return library
 
 
-@dataclass(frozen=True)
-class Surfels:
-    """Surface elements, one per voxel with enough points.
+@dataclass(frozen=True, slots=True, eq=False)
+class Surfaces:
+    """The surface in each voxel with enough points.
 
     Attributes:
-        positions: mean of the voxel's points, metres, map frame (n, 3).
-        normals: unit normals, map frame (n, 3).
-        thickness_m: standard deviation across the surface, metres (n,).
-        points: number of points in the voxel (n,).
-        keys: key of the voxel (n,).
-        brightness: mean intensity of the voxel's returns as the sensor gives it, NaN where unknown (n,).
+        rows: rows of these voxels in ``VoxelMap.sums``, ascending (n,).
+        normals: unit normals of all voxels, map frame; not set where a voxel has no surface (N, 3).
+        thickness_m: standard deviation across the surface of all voxels, metres; not set where a voxel has no surface (N,).
     """
 
-    positions: NDArray[np.float64]
+    rows: NDArray[np.int32]
     normals: NDArray[np.float32]
     thickness_m: NDArray[np.float32]
-    points: NDArray[np.uint32]
-    keys: NDArray[np.int64]
-    brightness: NDArray[np.float32]
 
 
 class VoxelMap:
-    """Moments of points in voxels; ``surfels`` computes the surfels.
+    """Moments of points in voxels; ``surfels_by_tile`` computes the surfels.
 
     The number of keys limits the reach (``reach_m``): 157 km from the origin along each axis with voxels of 0.3 m. A method that adds
     points beyond it raises ``DatasetError``.
@@ -109,8 +105,7 @@ class VoxelMap:
 
     def __init__(self, voxel_m: float, origin: NDArray[np.float64]) -> None:
         self.voxel_m, self.origin = voxel_m, origin
-        self._keys = np.zeros(0, np.int64)
-        self._moments = np.zeros((0, _MOMENTS), np.float32)
+        self._keys, self._moments = np.zeros(0, np.int64), np.zeros((0, MOMENTS), np.float32)
         self._waiting: list[tuple[NDArray[np.int64], NDArray[np.float32]]] = []
 
     @property
@@ -153,7 +148,7 @@ class VoxelMap:
         count = len(points)
         bright = None if intensity is None else np.ascontiguousarray(intensity, np.float32)
         key_of, numbers = np.empty(count, np.int64), np.empty((2, count), np.int32)
-        keys, moments = np.empty(count, np.int64), np.empty((count, _MOMENTS), np.float32)
+        keys, moments = np.empty(count, np.int64), np.empty((count, MOMENTS), np.float32)
         origin = np.ascontiguousarray(self.origin, np.float64)
         found = _library().streetfix_sums(
             points.ctypes.data,
@@ -185,15 +180,16 @@ class VoxelMap:
 
     def _add(self, keys: NDArray[np.int64], moments: NDArray[np.floating[Any]]) -> None:
         self._waiting.append((keys, np.ascontiguousarray(moments, np.float32)))
-        # The limit grows with the map, so even a large map is seldom copied. It depends on the added rows only, so the same calls give
-        # the same rounding.
+        # The limit grows with the map, so the rows of a large map are seldom moved. It depends on the added rows only, so the same calls
+        # give the same rounding.
         if sum(len(k) for k, _ in self._waiting) >= max(_WAITING, len(self._keys) // 4):
             self._merge()
 
     def sums(self) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
         """Return the keys of all voxels, ascending (n,), and their moments about the voxel's centre (n, 12).
 
-        The moments are those of the map itself, so they change if points are added.
+        The arrays are those of the map itself. If points are added later, they keep their length, and the moments of known voxels may
+        change.
         """
         self._merge()
         return self._keys, self._moments
@@ -221,18 +217,52 @@ class VoxelMap:
     def means(self) -> NDArray[np.float64]:
         """Return the mean of each voxel's points (n, 3), metres, map frame, in the order of ``sums``."""
         self._merge()
-        return self._means_of(slice(None))
+        return self.means_of(slice(None))
+
+    def means_of(self, voxels: NDArray[np.integer[Any]] | slice) -> NDArray[np.float64]:
+        """Return the mean of the points of some voxels (n, 3), metres, map frame.
+
+        Args:
+            voxels: rows of the voxels in ``sums`` (n,).
+        """
+        self._merge()
+        keys, points = self._keys[voxels], self._moments[voxels, 0].astype(np.float64)
+        means = np.empty((len(keys), 3))
+        for axis in range(3):  # one after the other: a large map has no room for all
+            centre = self.origin[axis] + (_axis_of_keys(keys, axis) + 0.5) * self.voxel_m
+            means[:, axis] = centre + self._moments[voxels, 1 + axis] / points
+        return means
 
     def statistics(self) -> NDArray[Any]:
         """Return all voxels in the format of a bundle: (n,) of ``VOXEL``. The origin must come from ``lattice_origin``."""
-        keys, moments = self.sums()
-        found = np.zeros(len(keys), VOXEL)
-        for part in _parts(len(keys)):
-            for axis, corner in enumerate(self._lattice()):
-                found["cell"][part, axis] = _axis_of_keys(keys[part], axis) + corner
-            found["points"][part], found["sums"][part] = moments[part, 0], moments[part, 1 : _BRIGHT.start]
-            found["brightness"][part], found["bright_points"][part] = moments[part, _BRIGHT].T
+        found = np.zeros(len(self.sums()[0]), VOXEL)
+        words = found.view(np.uint32).reshape(len(found), VOXEL.itemsize // 4)
+        for column, values in enumerate(self.columns().each()):
+            words[:, column] = values.view(np.uint32)
         return found
+
+    def columns(self) -> Columns:
+        """Return all voxels in the format of a bundle, number by number.
+
+        They are computed while they are written, so the map must not change before.
+        """
+        keys, moments = self.sums()
+        corner = self._lattice()
+
+        def cells(axis: int) -> NDArray[np.int32]:
+            found = np.empty(len(keys), np.int32)
+            for part in parts(len(keys)):
+                found[part] = _axis_of_keys(keys[part], axis) + corner[axis]
+            return found
+
+        def each() -> Iterator[NDArray[Any]]:
+            yield from map(cells, range(3))
+            yield moments[:, 0].astype(np.uint32)
+            for column in range(1, _BRIGHT.start + 1):
+                yield np.ascontiguousarray(moments[:, column])
+            yield moments[:, MOMENTS - 1].astype(np.uint32)
+
+        return Columns(len(keys), VOXEL.itemsize // 4, each)
 
     def add_statistics(self, statistics: NDArray[Any]) -> None:
         """Add the ``statistics`` of another map with the same voxel edge.
@@ -248,7 +278,7 @@ class VoxelMap:
         cell = statistics["cell"].astype(np.int64) - self._lattice()
         self.require_within(self.origin + cell * self.voxel_m, lambda _: "a voxel of the added map")
         keys = _keys_of_cells(cell)
-        moments = np.zeros((len(keys), _MOMENTS), np.float32)
+        moments = np.zeros((len(keys), MOMENTS), np.float32)
         moments[:, 0], moments[:, 1 : _BRIGHT.start] = statistics["points"], statistics["sums"]
         moments[:, _BRIGHT] = np.stack([statistics["brightness"], statistics["bright_points"]], axis=1)
         self._add(*_summed(keys, moments))
@@ -282,66 +312,38 @@ class VoxelMap:
     def _merge(self) -> None:
         if not self._waiting:
             return
-        added, moments = _summed(*(np.concatenate(each) for each in zip(*self._waiting, strict=True)))
+        keys, moments = (np.concatenate(each) for each in zip(*self._waiting, strict=True))
         self._waiting = []
+        added, moments = _summed(keys, moments)
         at = np.searchsorted(self._keys, added)
         known = at < len(self._keys)
         known[known] = self._keys[at[known]] == added[known]
         self._moments[at[known]] += moments[known]
-        fresh = at[~known] + np.arange(len(added) - int(known.sum()))  # where the new voxels go, in ascending order
-        if not len(fresh):
-            return
-        old = np.ones(len(self._keys) + len(fresh), np.bool_)
-        old[fresh] = False
-        keys, sums = np.empty(len(old), np.int64), np.empty((len(old), _MOMENTS), np.float32)
-        keys[old], keys[fresh] = self._keys, added[~known]
-        sums[old], sums[fresh] = self._moments, moments[~known]
-        self._keys, self._moments = keys, sums
+        if not known.all():
+            self._insert(at[~known], added[~known], moments[~known])
 
-    def surfels(self, *, fewest: int = FEWEST) -> "Surfels":
-        """Compute one surfel for each voxel with enough points for a normal.
+    def _insert(self, at: NDArray[np.int64], new_keys: NDArray[np.int64], new_moments: NDArray[np.float32]) -> None:
+        """Insert voxels before some rows, as ``np.insert`` does. A large map has no room for a copy of itself, so it grows in place."""
+        keys, moments, count, total = self._keys, self._moments, len(self._keys), len(self._keys) + len(at)
+        # NumPy resizes an array only if a single variable refers to it.
+        self._keys, self._moments = _NO_KEYS, _NO_MOMENTS
+        try:
+            keys.resize(total)
+            moments.resize((total, MOMENTS))
+            _insert_in_place(keys, count, at, new_keys)
+            _insert_in_place(moments, count, at, new_moments)
+        except ValueError:  # a caller of ``sums`` still has an array
+            keys = np.insert(keys[:count], at, new_keys)
+            moments = np.insert(moments, at, new_moments, axis=0)
+        finally:
+            self._keys, self._moments = keys, moments
+
+    def surfaces(self, *, fewest: int = FEWEST) -> Surfaces:
+        """Compute the surface in each voxel with enough points for a normal.
 
         Args:
             fewest: smallest number of points in the voxel and its 26 neighbours together.
         """
-        keep, normals, thickness = self._surfaces(fewest)
-        points = self._moments[keep, 0].astype(np.uint32)
-        return Surfels(
-            self._means_of(keep), normals[keep], thickness[keep], points, self._keys[keep], self._brightness_of(keep)
-        )
-
-    def surfels_by_tile(self) -> tuple[NDArray[Any], NDArray[np.float64], NDArray[np.float32]]:
-        """Compute the surfels, sorted by tile, in the format of ``SurfelMap.prepare``.
-
-        The positions are float32. Their resolution is 0.1 mm up to 1 km from the origin, and 1 mm up to 16 km. The surfels are filled in a
-        part at a time: a map of five million surfels has no room for copies.
-
-        Returns:
-            Surfels (n,) of ``SURFEL`` with positions relative to ``origin``; tiles (T, 4): centre x, y (metres, same frame), first surfel
-            and number of surfels; brightness of each surfel (n,).
-        """
-        keep, normals, thickness = self._surfaces(FEWEST)
-        tile = np.empty(len(keep), np.int64)
-        for part in _parts(len(keep)):
-            x, y = np.floor((self._means_of(keep[part])[:, :2] - self.origin[:2]) / TILE_M).astype(np.int64).T
-            tile[part] = x * _SPAN + y  # both are far below _SPAN / 2
-        order = np.argsort(tile, kind="stable")
-        tile, keep = tile[order], keep[order]
-        first = _first_of_each(tile)
-        column = np.rint(tile[first] / _SPAN)
-        corners = np.stack([column, tile[first] - column * _SPAN], axis=1)
-        del order, tile
-        surfels, brightness = np.zeros(len(keep), SURFEL), np.empty(len(keep), np.float32)
-        for part in _parts(len(keep)):
-            rows = keep[part]
-            surfels["xyz"][part] = self._means_of(rows) - self.origin
-            surfels["normal"][part], surfels["thickness_m"][part] = normals[rows], thickness[rows]
-            surfels["points"][part], brightness[part] = self._moments[rows, 0], self._brightness_of(rows)
-        count = np.diff(np.r_[first, len(keep)])
-        return surfels, np.c_[(corners + 0.5) * TILE_M, first, count], brightness
-
-    def _surfaces(self, fewest: int) -> tuple[NDArray[np.int64], NDArray[np.float32], NDArray[np.float32]]:
-        """Return the rows of the voxels with a surfel, and the normal and the thickness (m) of all voxels."""
         self._merge()
         count = len(self._keys)
         around, normals, thickness = np.empty(count), np.empty((count, 3), np.float32), np.empty(count, np.float32)
@@ -357,21 +359,45 @@ class VoxelMap:
             normals.ctypes.data,
             thickness.ctypes.data,
         )
-        return np.flatnonzero(around >= fewest), normals, thickness
+        enough = around >= fewest
+        del around
+        return Surfaces(np.flatnonzero(enough).astype(np.int32), normals, thickness)
 
-    def _brightness_of(self, rows: NDArray[np.int64]) -> NDArray[np.float32]:
+    def surfels_by_tile(self) -> tuple[NDArray[Any], NDArray[np.float64], NDArray[np.float32]]:
+        """Compute the surfels, sorted by tile, in the format of ``SurfelMap.prepare``.
+
+        The positions are float32. Their resolution is 0.1 mm up to 1 km from the origin, and 1 mm up to 16 km. The surfels are filled in a
+        part at a time: a map of five million surfels has no room for copies.
+
+        Returns:
+            Surfels (n,) of ``SURFEL`` with positions relative to ``origin``; tiles (T, 4): centre x, y (metres, same frame), first surfel
+            and number of surfels; brightness of each surfel (n,).
+        """
+        found = self.surfaces()
+        tiles, tile = ranked(len(found.rows), lambda part: self._tiles_of(found.rows[part]))
+        order = np.argsort(tile, kind="stable")
+        first = np.searchsorted(tile, np.arange(len(tiles) + 1), sorter=order)
+        rows = found.rows[order]
+        del order, tile
+        surfels, brightness = np.zeros(len(rows), SURFEL), np.empty(len(rows), np.float32)
+        for part in parts(len(rows)):
+            of = rows[part]
+            surfels["xyz"][part] = self.means_of(of) - self.origin
+            surfels["normal"][part], surfels["thickness_m"][part] = found.normals[of], found.thickness_m[of]
+            surfels["points"][part], brightness[part] = self._moments[of, 0], self._brightness_of(of)
+        column = np.rint(tiles / SPAN)
+        corners = np.stack([column, tiles - column * SPAN], axis=1)
+        return surfels, np.c_[(corners + 0.5) * TILE_M, first[:-1], np.diff(first)], brightness
+
+    def _tiles_of(self, rows: NDArray[np.int32]) -> NDArray[np.int64]:
+        """Return the number of the tile of each voxel (n,): column times ``SPAN``, plus row."""
+        x, y = np.floor((self.means_of(rows)[:, :2] - self.origin[:2]) / TILE_M).astype(np.int64).T
+        return np.asarray(x * SPAN + y)  # both are far below SPAN / 2
+
+    def _brightness_of(self, rows: NDArray[np.int32]) -> NDArray[np.float32]:
         bright, told = (self._moments[rows, column] for column in (_BRIGHT.start, _BRIGHT.start + 1))
         mean: NDArray[np.float32] = np.divide(bright, told, out=np.full(len(rows), np.nan, np.float32), where=told > 0)
         return mean
-
-    def _means_of(self, voxels: NDArray[np.int64] | slice) -> NDArray[np.float64]:
-        """Return the mean of the points of some voxels (n, 3), metres, map frame."""
-        keys, points = self._keys[voxels], self._moments[voxels, 0].astype(np.float64)
-        means = np.empty((len(keys), 3))
-        for axis in range(3):  # one after the other: a large map has no room for all
-            centre = self.origin[axis] + (_axis_of_keys(keys, axis) + 0.5) * self.voxel_m
-            means[:, axis] = centre + self._moments[voxels, 1 + axis] / points
-        return means
 
 
 def lattice_origin(voxel_m: float, near: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -385,13 +411,13 @@ def lattice_origin(voxel_m: float, near: NDArray[np.float64]) -> NDArray[np.floa
 
 
 def _keys_of_cells(cell: NDArray[np.int64]) -> NDArray[np.int64]:
-    shifted = cell + _SPAN // 2
-    return np.asarray((shifted[:, 0] * _SPAN + shifted[:, 1]) * _SPAN + shifted[:, 2])
+    shifted = cell + SPAN // 2
+    return np.asarray((shifted[:, 0] * SPAN + shifted[:, 1]) * SPAN + shifted[:, 2])
 
 
 def _axis_of_keys(keys: NDArray[np.int64], axis: int) -> NDArray[np.int64]:
     """Return the cell of each key along an axis (n,)."""
-    return np.asarray(keys // _SPAN ** (2 - axis) % _SPAN - _SPAN // 2)
+    return np.asarray(keys // SPAN ** (2 - axis) % SPAN - SPAN // 2)
 
 
 def _moments_of(local: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -408,8 +434,46 @@ def _summed(keys: NDArray[np.int64], moments: NDArray[_Float]) -> tuple[NDArray[
     return keys[first], np.add.reduceat(moments, first, axis=0) if len(first) else moments
 
 
-def _parts(count: int) -> list[slice]:
+def _insert_in_place(array: NDArray[Any], count: int, at: NDArray[np.int64], rows: NDArray[Any]) -> None:
+    """Insert rows into an array in place.
+
+    Args:
+        array: the array; its rows from ``count`` on are free (count + f, ...).
+        count: number of rows that it has.
+        at: rows before which to insert, ascending, 0 to ``count`` (f,).
+        rows: the new rows (f, ...).
+    """
+    for part in reversed(parts(count)):  # from the end, because a row only moves towards the end
+        old = np.arange(part.start, part.stop)
+        array[old + np.searchsorted(at, old, side="right")] = array[part].copy()
+    array[at + np.arange(len(at))] = rows
+
+
+def parts(count: int) -> list[slice]:
+    """Return slices that cover ``count`` rows, so that copies of their values stay small.
+
+    Args:
+        count: number of rows.
+    """
     return [slice(first, min(first + _PART, count)) for first in range(0, count, _PART)]
+
+
+def ranked(count: int, numbers_of: Callable[[slice], NDArray[np.int64]]) -> tuple[NDArray[np.int64], NDArray[np.int32]]:
+    """Return the distinct numbers of many rows, ascending (k,), and the index of each row's number among them (count,).
+
+    An index takes four bytes, a number eight.
+
+    Args:
+        count: number of rows.
+        numbers_of: returns the numbers of a slice of the rows. It is called twice for each.
+    """
+    found = np.zeros(0, np.int64)
+    for part in parts(count):
+        found = np.union1d(found, numbers_of(part))
+    rank = np.empty(count, np.int32)
+    for part in parts(count):
+        rank[part] = np.searchsorted(found, numbers_of(part))
+    return found, rank
 
 
 def _first_of_each(keys: NDArray[np.int64]) -> NDArray[np.int64]:

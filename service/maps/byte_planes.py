@@ -4,6 +4,8 @@ A file is one zstd frame. Its content is the first byte of every record, then th
 kind lie together, so they compress well.
 """
 
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -17,18 +19,45 @@ _LEVEL = 9
 _WINDOW = 2**27
 
 
-def write_records(path: Path, records: NDArray[Any]) -> None:
+@dataclass(frozen=True, slots=True, eq=False)
+class Columns:
+    """Records as columns: an array for each number of a record. Every number has four bytes. A column may be computed when it is written.
+
+    Attributes:
+        rows: number of records.
+        width: how many numbers a record has.
+        each: returns the columns (rows,), in the order of a record's numbers.
+    """
+
+    rows: int
+    width: int
+    each: Callable[[], Iterable[NDArray[Any]]]
+
+    @classmethod
+    def of(cls, records: NDArray[Any]) -> "Columns":
+        """Return the columns of records in memory.
+
+        Args:
+            records: (n,) of a type whose size is a multiple of four bytes.
+        """
+        width = records.dtype.itemsize // 4
+        words = np.ascontiguousarray(records).view(np.uint32).reshape(len(records), width)
+        return cls(len(records), width, lambda: (np.ascontiguousarray(column) for column in words.T))
+
+
+def write_records(path: Path, records: Columns) -> None:
     """Write records.
 
     Args:
         path: the new file.
-        records: records of any structured type (n,).
+        records: the records.
     """
-    rows = np.ascontiguousarray(records).view(np.uint8).reshape(len(records), records.dtype.itemsize)
-    # Plane by plane, so that the memory does not hold all planes beside the records.
-    with path.open("wb") as file, zstandard.ZstdCompressor(level=_LEVEL).stream_writer(file, size=rows.size) as writer:
-        for plane in rows.T:
-            writer.write(np.ascontiguousarray(plane).data)
+    # Plane by plane, so that the memory does not hold all planes.
+    size = records.rows * records.width * 4
+    with path.open("wb") as file, zstandard.ZstdCompressor(level=_LEVEL).stream_writer(file, size=size) as writer:
+        for column in records.each():
+            for plane in column.view(np.uint8).reshape(records.rows, 4).T:
+                writer.write(np.ascontiguousarray(plane).data)
 
 
 def read_records(path: Path, dtype: np.dtype[Any]) -> NDArray[Any]:

@@ -9,6 +9,7 @@ from jaxtyping import Bool, Float32, Float64, Int32
 from numpy.typing import NDArray
 
 from service.imaging.view_grid import ViewGrid
+from service.maps.byte_planes import Columns
 from service.registration.surfel_map import SurfelMap
 
 PLACES_FILE, VIEWS_FILE = "places.npy", "views.npy"
@@ -52,7 +53,8 @@ class BundleContent:
         parameters: further numbers that the map was built with. ``lidar_height_m`` is required.
         streets: GeoJSON FeatureCollection. None if the map has no streets.
         cloud: the prepared cloud. None if the map has nothing to register against.
-        statistics: sums over the points of each voxel of the cloud, for merging and updating. None stores none.
+        statistics: sums over the points of each voxel of the cloud, for merging and updating; they may be computed while they are
+            written. None stores none.
         calibration: content of ``calibration.json``. The default states that there is no calibration.
         preview_webp: image of the map from above. May be empty.
         georeference: arguments of ``Georeference`` for the map's origin. None if the position on the Earth is unknown.
@@ -74,7 +76,7 @@ class BundleContent:
     parameters: Mapping[str, float]
     streets: Mapping[str, Any] | None = None
     cloud: SurfelMap | None = None
-    statistics: NDArray[Any] | None = None
+    statistics: Columns | None = None
     calibration: Mapping[str, Any] = field(default_factory=lambda: dict(UNCALIBRATED))
     preview_webp: bytes = b""
     georeference: Mapping[str, Any] | None = None

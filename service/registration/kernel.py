@@ -422,13 +422,12 @@ def _regions(
     """
     frame = _Grid(*origin_m, cell_m)
     edge = REGION * BLOCK
-    keys, which = _touched(surfels, origin_m, edge * cell_m, reach_m)
+    keys, starts, which = _touched(surfels, origin_m, edge * cell_m, reach_m)
     surfel_of, distance2 = np.empty(edge**3, np.int32), np.empty(edge**3, np.float32)
     blocks, nearest = np.empty(REGION**3, GRID_BLOCK), np.empty(edge**3, np.int32)
-    starts = np.flatnonzero(np.r_[True, keys[1:] != keys[:-1]])
-    for first, end in zip(starts, np.r_[starts[1:], len(keys)], strict=True):
+    for key, first, end in zip(keys, starts[:-1], starts[1:], strict=True):
         region, some = np.zeros(1, GRID_REGION), which[first:end]
-        region["key"] = keys[first]
+        region["key"] = key
         count = _library().streetfix_build_region(
             byref(frame),
             surfels.ctypes.data,
@@ -448,25 +447,38 @@ def _regions(
 
 def _touched(
     surfels: NDArray[Any], origin_m: Float64[NDArray[np.float64], "3"], region_m: float, reach_m: float
-) -> tuple[NDArray[np.int64], Int32[NDArray[np.int32], " p"]]:
-    """Return all pairs of a region and a surfel whose reach touches it: keys of regions, ascending, and indices of surfels.
+) -> tuple[NDArray[np.int64], NDArray[np.int64], Int32[NDArray[np.int32], " p"]]:
+    """Return the surfels whose reach touches each region: keys of regions (R,), ascending; first entry of each (R + 1,); indices (p,).
 
     The surfels of a region are ascending. So the first of two equally near surfels counts, wherever regions begin.
     """
-    keys, numbers = [], []
-    for first in range(0, len(surfels), _CHUNK):
+
+    def pairs_of(first: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         xyz = surfels["xyz"][first : first + _CHUNK].astype(np.float64) - origin_m
         low, high = (np.floor((xyz + sign * reach_m) / region_m).astype(np.int64) for sign in (-1, 1))
+        keys, numbers = [], []
         for step in product(*(range(int(extent) + 1) for extent in (high - low).max(axis=0))):
             region = low + step
             inside = np.flatnonzero((region <= high).all(axis=1))
             x, y, z = region[inside].T
             keys.append((x << 2 * KEY_BITS) + (y << KEY_BITS) + z)
-            numbers.append((inside + first).astype(np.int32))
-    key, which = np.concatenate(keys), np.concatenate(numbers)
-    del keys, numbers  # a large map has no room for both copies
-    order = np.lexsort((which, key))
-    return key[order], which[order]
+            numbers.append(inside + first)
+        return np.concatenate(keys), np.concatenate(numbers)
+
+    # A pair is one number of 64 bits: the row of the region, then the surfel. So the pairs are sorted in place. The first round finds the
+    # regions and counts the pairs.
+    regions, count = np.zeros(0, np.int64), 0
+    for first in range(0, len(surfels), _CHUNK):
+        keys, _ = pairs_of(first)
+        regions, count = np.union1d(regions, keys), count + len(keys)
+    pairs, filled = np.empty(count, np.int64), 0
+    for first in range(0, len(surfels), _CHUNK):
+        keys, numbers = pairs_of(first)
+        pairs[filled : filled + len(keys)] = (np.searchsorted(regions, keys) << 32) + numbers
+        filled += len(keys)
+    pairs.sort()
+    starts = np.searchsorted(pairs, np.arange(len(regions) + 1) << 32)
+    return regions, starts, pairs.astype(np.int32)  # the lower half
 
 
 def render(

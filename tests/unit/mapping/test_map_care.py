@@ -17,6 +17,7 @@ from model_training.mapping.verify import damage_of
 from model_training.mapping.voxel_map import VOXEL, VoxelMap
 from service.cli import main as command_line
 from service.errors import BundleError
+from service.maps.byte_planes import Columns
 from service.maps.reader import MapBundle
 from service.maps.writer import write_bundle
 from service.registration.surfel_map import SurfelMap
@@ -116,8 +117,11 @@ def test_a_manifest_of_another_format_is_named(own):
             lambda _: {"place_street": np.array([2] * 6 + [1, 1, 2, 2, 2, 2], np.int32)},
             r"places\.npy: 6 places are outside the streets that they name",
         ),
-        (lambda _: {"statistics": np.zeros(3)}, r"voxels\.zst: .*24 bytes are no whole records of 60 bytes"),
-        (lambda _: {"statistics": np.zeros(3, VOXEL)}, r"voxels\.zst: a voxel has no points"),
+        (
+            lambda _: {"statistics": Columns.of(np.zeros(3))},
+            r"voxels\.zst: .*24 bytes are no whole records of 60 bytes",
+        ),
+        (lambda _: {"statistics": Columns.of(np.zeros(3, VOXEL))}, r"voxels\.zst: a voxel has no points"),
     ],
 )
 def test_contradicting_contents_are_reported(content, tmp_path, change, message):

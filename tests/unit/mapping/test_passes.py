@@ -198,10 +198,38 @@ def test_bits_are_nothing_out_of_reach():
     assert found.bits(0, tiles).tolist() == [1, 0]
 
 
+#: A direction in the middle of a cell of the range image.
+AHEAD = np.array([1.0, 0.004, 0.004])
+
+
+def cloud_of(positions):
+    """Return a voxel map with a point at each position."""
+    cloud = VoxelMap(0.3, np.array([30.0, -20.0, 5.0]))
+    cloud.add(np.array(positions))
+    return cloud
+
+
 def targets_at(position, normal):
-    keys = np.array([0])
-    tile = tile_of(np.array([position]))
-    return Targets(keys, np.array([position]), np.array([normal], np.float32), tile, np.array([0]), 0.3)
+    return Targets.at(cloud_of([position]), np.zeros(1, np.int32), np.array([normal], np.float32))
+
+
+def test_targets_are_found_by_tile_and_by_key():
+    """Rows 0, 1 and 3 have a surface, and row 2 has none. Row 3 lies in another tile."""
+    cloud = cloud_of([[0.5, 0.5, 0.0], [1.5, 1.5, 0.0], [2.5, 2.5, 0.0], [25.5, 0.5, 0.0]])
+    found = Targets.at(cloud, np.array([0, 1, 3], np.int32), np.ones((4, 3), np.float32))
+    here, there, nowhere = tile_of(np.array([[0.0, 0.0], [25.0, 0.0], [-500.0, 0.0]]))
+    assert found.of_tiles(np.array([here])).tolist() == [0, 1]
+    assert found.of_tiles(np.sort([here, there, nowhere])).tolist() == [0, 1, 3]
+    assert found.of_tiles(np.array([nowhere])).tolist() == []
+    keys, _ = cloud.sums()
+    assert found.with_keys(np.array([keys[0] - 1, keys[1], keys[2], keys[3], keys[3] + 1])).tolist() == [1, 3]
+    assert found.numbers_of(np.array([0, 1, 3])).tolist() == [here, here, there]
+
+
+def test_a_map_without_surfaces_has_no_targets():
+    found = Targets.of(VoxelMap(0.3, np.zeros(3)))
+    assert found.of_tiles(tile_of(np.zeros((1, 3)))).tolist() == []
+    assert found.with_keys(np.array([5])).tolist() == []
 
 
 @pytest.mark.parametrize(
@@ -215,28 +243,27 @@ def targets_at(position, normal):
     ],
 )
 def test_one_ray_by_hand(end_m, normal, through):
-    found = looked_through(
-        targets_at([10.0, 0.0, 0.0], normal), np.array([0]), np.array([[end_m, 0.0, 0.0]]), np.eye(4), behind_m=0.6
-    )
+    targets = targets_at(10.0 * AHEAD, normal)
+    found = looked_through(targets, np.zeros(1, np.int32), end_m * AHEAD[None], np.eye(4), behind_m=0.6)
     assert found.tolist() == ([0] if through else [])
 
 
 def test_a_ray_beside_it_that_ends_before_it_saves_it():
     beside = 9.9 * np.array([np.cos(0.006), np.sin(0.006), 0.0])
-    points = np.array([[20.0, 0.0, 0.0], beside])
-    targets = targets_at([10.0, 0.0, 0.0], (1.0, 0.0, 0.0))
-    assert looked_through(targets, np.array([0]), points, np.eye(4), behind_m=0.6).tolist() == []
+    points = np.array([20.0 * AHEAD, beside])
+    targets = targets_at(10.0 * AHEAD, (1.0, 0.0, 0.0))
+    assert looked_through(targets, np.zeros(1, np.int32), points, np.eye(4), behind_m=0.6).tolist() == []
 
 
 def test_where_no_ray_goes_there_is_no_vote():
-    targets = targets_at([10.0, 0.0, 0.0], (1.0, 0.0, 0.0))
+    targets = targets_at(10.0 * AHEAD, (1.0, 0.0, 0.0))
     points = np.array([[0.0, 20.0, 0.0]])
-    assert looked_through(targets, np.array([0]), points, np.eye(4), behind_m=0.6).tolist() == []
+    assert looked_through(targets, np.zeros(1, np.int32), points, np.eye(4), behind_m=0.6).tolist() == []
 
 
 def test_an_empty_scan_looks_through_nothing():
-    targets = targets_at([10.0, 0.0, 0.0], (1.0, 0.0, 0.0))
-    assert looked_through(targets, np.array([0]), np.zeros((0, 3)), np.eye(4), behind_m=0.6).tolist() == []
+    targets = targets_at(10.0 * AHEAD, (1.0, 0.0, 0.0))
+    assert looked_through(targets, np.zeros(1, np.int32), np.zeros((0, 3)), np.eye(4), behind_m=0.6).tolist() == []
 
 
 def slow_looked_through(targets, points, T_map_lidar, behind_m):
@@ -254,7 +281,7 @@ def slow_looked_through(targets, points, T_map_lidar, behind_m):
             if old is None or np.linalg.norm(p) <= np.linalg.norm(old):
                 nearest[row, column] = p
     found = []
-    for k, (position, normal) in enumerate(zip(targets.positions, targets.normals, strict=True)):
+    for k, (position, normal) in enumerate(zip(targets.cloud.means(), targets.normals, strict=True)):
         p = (position - T_map_lidar[:3, 3]) @ T_map_lidar[:3, :3]
         away = np.linalg.norm(p)
         row, column = cell(p)
@@ -263,7 +290,7 @@ def slow_looked_through(targets, points, T_map_lidar, behind_m):
         around = [nearest.get((row + a, (column + b) % 720)) for a in (-1, 0, 1) for b in (-1, 0, 1)]
         least = min(np.linalg.norm(each) for each in around if each is not None)
         end = nearest[row, column] @ T_map_lidar[:3, :3].T + T_map_lidar[:3, 3]
-        if least >= away * 1.01 + behind_m and abs((end - position) @ normal) > targets.voxel_m:
+        if least >= away * 1.01 + behind_m and abs((end - position) @ normal) > targets.cloud.voxel_m:
             found.append(k)
     return found
 
@@ -282,9 +309,10 @@ def test_the_compiled_vote_is_that_of_a_slow_loop(seed):
     positions = transform_points(T_map_lidar, rays[:400] * rng.uniform(1.0, 35.0, (400, 1)))
     normals = rng.normal(size=(400, 3)).astype(np.float32)
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-    tile = tile_of(positions)
-    targets = Targets(np.arange(400), positions, normals, tile, np.argsort(tile, kind="stable"), 0.3)
-    found = looked_through(targets, np.arange(400), points, T_map_lidar, behind_m=0.6)
+    cloud = cloud_of(positions)
+    rows = np.arange(len(cloud.sums()[0]), dtype=np.int32)
+    targets = Targets.at(cloud, rows, normals[rows])
+    found = looked_through(targets, rows, points, T_map_lidar, behind_m=0.6)
     expected = slow_looked_through(targets, points, T_map_lidar, 0.6)
     assert 50 < len(expected) < 390
     assert found.tolist() == expected

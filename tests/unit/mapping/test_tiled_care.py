@@ -18,6 +18,7 @@ from model_training.mapping.tiled_care import diff_of_tiles, merge_tiled, tiles_
 from model_training.mapping.verify import damage_of
 from service.errors import BundleError
 from service.localization.localizer import Localizer
+from service.maps.byte_planes import Columns
 from service.maps.calibration import RigCorrection
 from service.maps.manifest import read_manifest
 from service.maps.reader import MapBundle
@@ -32,7 +33,7 @@ TILE_M = 50.0
 def squares(small_map: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[tuple[int, int], Path]:
     """Three bundles with a third of the places each, and with the whole cloud. The squares only name them."""
     bundle, folder = MapBundle.open(small_map), tmp_path_factory.mktemp("squares")
-    content = replace(content_of(bundle), cloud=bundle.cloud, statistics=read_statistics(bundle))
+    content = replace(content_of(bundle), cloud=bundle.cloud, statistics=Columns.of(read_statistics(bundle)))
     third = np.arange(len(bundle.places)) * 3 // len(bundle.places)
     made = {}
     for column in range(3):

@@ -1,4 +1,5 @@
 import tracemalloc
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -8,6 +9,7 @@ from hypothesis import strategies as st
 from scipy.spatial import cKDTree
 
 from model_training.mapping.cloud import prepared
+from model_training.mapping.passes import Targets
 from model_training.mapping.voxel_map import VOXEL, VoxelMap, lattice_origin
 from service.errors import DatasetError
 from service.registration.surfel_map import TILE_M
@@ -18,6 +20,22 @@ def map_of(*clouds, voxel_m=0.5, origin=(100.0, -50.0, 2.0)):
     for cloud in clouds:
         voxels.add(np.asarray(cloud, np.float64))
     return voxels
+
+
+def surfels_of(voxels, *, fewest=5):
+    """Return the surfels of a map in the order of its voxels. Brightness is that of ``surfels_by_tile``."""
+    found = voxels.surfaces(fewest=fewest)
+    rows, (keys, moments) = found.rows, voxels.sums()
+    with np.errstate(invalid="ignore"):
+        brightness = moments[rows, 10] / moments[rows, 11]
+    return SimpleNamespace(
+        positions=voxels.means_of(rows),
+        normals=found.normals[rows],
+        thickness_m=found.thickness_m[rows],
+        points=moments[rows, 0],
+        keys=keys[rows],
+        brightness=brightness,
+    )
 
 
 def slow_surfels(points, *, voxel_m=0.5, origin=(100.0, -50.0, 2.0), fewest=5):
@@ -43,7 +61,7 @@ def cloud():
 
 
 def test_surfels_are_those_of_a_slow_loop(cloud):
-    found, expected = map_of(cloud).surfels(), slow_surfels(cloud)
+    found, expected = surfels_of(map_of(cloud)), slow_surfels(cloud)
     assert len(found.positions) == len(expected)
     order = np.lexsort(np.array([row[0] for row in expected]).T)
     mine = np.lexsort(found.positions.T)
@@ -55,7 +73,7 @@ def test_surfels_are_those_of_a_slow_loop(cloud):
 
 
 def test_scan_by_scan_gives_the_same_as_all_at_once(cloud):
-    one, parts = map_of(cloud).surfels(), map_of(*np.array_split(cloud, 150)).surfels()
+    one, parts = surfels_of(map_of(cloud)), surfels_of(map_of(*np.array_split(cloud, 150)))
     np.testing.assert_allclose(parts.positions, one.positions, atol=1e-6)
     np.testing.assert_allclose(parts.thickness_m, one.thickness_m, atol=1e-5)
     np.testing.assert_array_equal(parts.points, one.points)
@@ -66,7 +84,7 @@ def test_the_normal_of_a_plane_is_square_to_it():
     normal = np.array([1.0, 2.0, 2.0]) / 3
     flat = rng.uniform(-2, 2, (6000, 3))
     flat -= np.outer(flat @ normal, normal)
-    found = map_of(flat + [100, -50, 2]).surfels(fewest=30)
+    found = surfels_of(map_of(flat + [100, -50, 2]), fewest=30)
     assert np.abs(found.normals @ normal).min() > 0.999
     assert found.thickness_m.max() < 1e-3
 
@@ -76,7 +94,7 @@ def test_a_corner_is_not_rounded_off():
     rng = np.random.default_rng(4)
     u, v = rng.uniform(0, 3, (2, 30000))
     walls = np.concatenate([np.stack([u, 0 * u, v], axis=1)[:15000], np.stack([0 * u, u, v], axis=1)[15000:]])
-    found = map_of(walls + [100.1, -49.9, 2.0]).surfels(fewest=30)
+    found = surfels_of(map_of(walls + [100.1, -49.9, 2.0]), fewest=30)
     inside = (found.positions[:, 2] > 2.6) & (found.positions[:, 2] < 4.4)
     away = np.min(np.abs(found.positions[:, :2] - [100.1, -49.9]).max(axis=1)[:, None], axis=1)
     turned = 1 - np.max(np.abs(found.normals[:, :2]), axis=1)
@@ -88,18 +106,18 @@ def test_thickness_is_the_deviation_across_the_plane():
     slab = np.stack(
         [rng.uniform(98, 102, 40000), rng.uniform(-52, -48, 40000), 2.2 + rng.normal(0, 0.05, 40000)], axis=1
     )
-    found = map_of(slab).surfels(fewest=500)
+    found = surfels_of(map_of(slab), fewest=500)
     assert np.median(found.thickness_m) == pytest.approx(0.05, rel=0.1)
 
 
 def test_lonely_points_make_no_surfel():
-    assert len(map_of([[101.0, -49.0, 3.0]] * 4).surfels().positions) == 0
+    assert len(surfels_of(map_of([[101.0, -49.0, 3.0]] * 4)).positions) == 0
 
 
 def test_tiles_hold_every_surfel_once_and_within_their_edges():
     rng = np.random.default_rng(3)
     voxels = map_of(rng.uniform([0, -100, 0], [200, 60, 1], (60000, 3)), voxel_m=2.0)
-    surfels = voxels.surfels()
+    surfels = surfels_of(voxels)
     own, rows, _ = voxels.surfels_by_tile()
     assert rows[:, 3].sum() == len(own) == len(surfels.positions)
     np.testing.assert_array_equal(rows[:, 2], np.r_[0, np.cumsum(rows[:, 3])[:-1]])
@@ -117,7 +135,7 @@ def test_surfels_by_tile_are_the_same_surfels(monkeypatch):
     rng = np.random.default_rng(8)
     points = rng.uniform([0, 0, 0], [70, 70, 1], (60000, 3))
     voxels = lit(points, points[:, 2], origin=(0.0, 0.0, 0.0))
-    plain, (sorted_by_tile, tiles, brightness) = voxels.surfels(), voxels.surfels_by_tile()
+    plain, (sorted_by_tile, tiles, brightness) = surfels_of(voxels), voxels.surfels_by_tile()
     order = np.lexsort(np.floor(plain.positions[:, 1::-1] / TILE_M).T)
     assert len(tiles) == 4
     np.testing.assert_array_equal(sorted_by_tile["xyz"], plain.positions[order].astype(np.float32))
@@ -131,8 +149,8 @@ def test_coordinates_far_from_zero_lose_nothing():
     far = np.array([412_345.0, 5_654_321.0, 250.0])
     rng = np.random.default_rng(4)
     cloud = rng.uniform(-2, 2, (500, 3))
-    near_found = map_of(cloud, origin=(0, 0, 0)).surfels()
-    far_found = map_of(cloud + far, origin=far).surfels()
+    near_found = surfels_of(map_of(cloud, origin=(0, 0, 0)))
+    far_found = surfels_of(map_of(cloud + far, origin=far))
     np.testing.assert_allclose(far_found.positions - far, near_found.positions, atol=1e-6)
 
 
@@ -147,7 +165,7 @@ def test_sums_of_two_maps_with_other_origins_are_those_of_one(cloud):
         map_of(c, origin=o) for c, o in ((cloud[:500], near[0]), (cloud[500:], near[1]), (cloud, near[0]))
     )
     one.add_statistics(other.statistics())
-    found, expected = one.surfels(), whole.surfels()
+    found, expected = surfels_of(one), surfels_of(whole)
     np.testing.assert_array_equal(found.points, expected.points)
     np.testing.assert_allclose(found.positions, expected.positions, atol=1e-6)
     np.testing.assert_allclose(found.thickness_m, expected.thickness_m, atol=1e-4)
@@ -171,7 +189,7 @@ def lit(points, intensity, **rest):
 def test_brightness_is_the_mean_over_the_returns_of_a_voxel():
     """The left voxel has four returns, the right one has one. The neighbour's returns do not count."""
     points = [[0.1, 0.1, 0.1], [0.2, 0.3, 0.1], [0.3, 0.1, 0.2], [0.4, 0.4, 0.4], [0.6, 0.1, 0.1]]
-    found = lit(points, [0.1, 0.2, 0.3, 0.6, 0.9], origin=(0.0, 0.0, 0.0)).surfels()
+    found = surfels_of(lit(points, [0.1, 0.2, 0.3, 0.6, 0.9], origin=(0.0, 0.0, 0.0)))
     np.testing.assert_allclose(found.brightness, [0.3, 0.9], rtol=1e-6)
 
 
@@ -179,10 +197,10 @@ def test_points_without_a_brightness_do_not_dim_others():
     points = np.random.default_rng(5).uniform(0.01, 0.49, (8, 3))
     voxels = lit(points, np.full(8, 0.5), origin=(0.0, 0.0, 0.0))
     voxels.add(points)
-    found = voxels.surfels()
+    found = surfels_of(voxels)
     np.testing.assert_array_equal(found.points, [16])
     np.testing.assert_allclose(found.brightness, [0.5])
-    assert np.isnan(map_of(points, origin=(0.0, 0.0, 0.0)).surfels().brightness).all()
+    assert np.isnan(surfels_of(map_of(points, origin=(0.0, 0.0, 0.0))).brightness).all()
 
 
 def test_brightness_goes_along_with_its_surfel():
@@ -198,8 +216,8 @@ def test_statistics_keep_brightness(cloud):
     near = lattice_origin(0.5, np.array([98.0, -50.0, 1.0]))
     one, other = (lit(cloud[part], intensity[part], origin=near) for part in (slice(0, 500), slice(500, None)))
     one.add_statistics(other.statistics())
-    expected = lit(cloud, intensity, origin=near).surfels().brightness
-    np.testing.assert_allclose(one.surfels().brightness, expected, atol=1e-6)
+    expected = surfels_of(lit(cloud, intensity, origin=near)).brightness
+    np.testing.assert_allclose(surfels_of(one).brightness, expected, atol=1e-6)
 
 
 def test_a_cloud_of_two_towns_60_km_apart_takes_what_both_take():
@@ -281,8 +299,8 @@ def test_neighbours_of_the_farthest_voxels_are_theirs():
     far = voxels.reach_m - 0.5
     ends = [[0.5, far, 0.5], [1.5, -far, 0.5]]
     voxels.add(np.repeat(np.array(ends), 4, axis=0))
-    assert len(voxels.surfels(fewest=4).positions) == 2
-    assert len(voxels.surfels(fewest=5).positions) == 0
+    assert len(surfels_of(voxels, fewest=4).positions) == 2
+    assert len(surfels_of(voxels, fewest=5).positions) == 0
 
 
 def test_sums_of_a_map_out_of_reach_are_refused():
@@ -292,18 +310,79 @@ def test_sums_of_a_map_out_of_reach_are_refused():
         near.add_statistics(far.statistics())
 
 
-def test_surfels_take_little_more_memory_than_their_arrays():
-    """A voxel of a surfel has 56 bytes, and its surfel as many. The sums of the neighbours need no arrays of their own."""
-    rng = np.random.default_rng(2)
+@pytest.mark.parametrize("held", [(0,), (1,), (0, 1), ()])
+def test_a_caller_of_sums_keeps_arrays_of_their_length(cloud, held):
+    """The map grows in place only if nobody else has its arrays."""
+    half = len(cloud) // 2
+    one, other = map_of(cloud[:half], cloud[half:]), map_of(cloud[:half])
+    kept = [other.sums()[k] for k in held]
+    before = [len(each) for each in kept]
+    other.add(cloud[half:])
+    np.testing.assert_array_equal(other.sums()[0], one.sums()[0])
+    np.testing.assert_allclose(other.sums()[1], one.sums()[1], atol=1e-5)
+    assert [len(each) for each in kept] == before
+    assert len(other.sums()[0]) > 100
+
+
+@given(st.lists(st.lists(st.integers(-20, 20), max_size=30), max_size=8), st.integers(1, 7))
+def test_a_map_that_grows_in_place_is_the_map_of_all_points(batches, part):
+    """Points in the middle of cells along a line; the map merges after each batch, and moves a few rows at a time."""
+    grown, points = VoxelMap(1.0, np.zeros(3)), []
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("model_training.mapping.voxel_map._PART", part)
+        for batch in batches:
+            batch_points = [[cell + 0.5, 0.5, 0.5] for cell in batch]
+            grown.add(np.array(batch_points).reshape(-1, 3))
+            grown.means()
+            points += batch_points
+    whole = VoxelMap(1.0, np.zeros(3))
+    whole.add(np.array(points).reshape(-1, 3))
+    np.testing.assert_array_equal(grown.sums()[0], whole.sums()[0])
+    np.testing.assert_array_equal(grown.sums()[1], whole.sums()[1])
+
+
+def test_a_map_grows_without_a_copy_of_itself(monkeypatch):
+    monkeypatch.setattr("model_training.mapping.voxel_map._PART", 1 << 12)
+    rng = np.random.default_rng(5)
     voxels = VoxelMap(0.3, np.zeros(3))
-    voxels.add(np.concatenate([rng.uniform([0, 0, 0], [90, 90, 0.6], (400_000, 3))] * 2))
-    count = len(voxels.sums()[0])
-    voxels.surfels()
     tracemalloc.start()
-    voxels.surfels()
+    voxels.add(rng.uniform([0, 0, 0], [300, 300, 0.3], (3_000_000, 3)))
+    before = len(voxels.sums()[0])
+    voxels.add(rng.uniform([290, 0, 0], [330, 300, 0.3], (300_000, 3)))
+    held = tracemalloc.get_traced_memory()[0]
+    tracemalloc.reset_peak()
+    added = len(voxels.sums()[0]) - before
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
-    assert peak < 250 * count
+    assert added > 50_000
+    assert peak - held < 0.5 * 56 * before  # a copy would take 56 bytes for each voxel
+
+
+@pytest.mark.parametrize(
+    ("work", "most"),
+    [
+        (lambda voxels: voxels.surfaces(), 30),
+        (lambda voxels: voxels.surfels_by_tile(), 80),
+        (lambda voxels: sum(column.sum(dtype=np.float64) for column in voxels.columns().each()), 10),
+        (lambda voxels: voxels.statistics(), 72),
+        (lambda voxels: Targets.of(voxels), 50),
+    ],
+    ids=["surfaces", "surfels", "columns", "statistics", "targets"],
+)
+def test_bytes_beside_a_large_map(work, most, monkeypatch):
+    """A voxel has 56 bytes. A tile of a town has five million, so each byte beside them counts."""
+    monkeypatch.setattr("model_training.mapping.voxel_map._PART", 1 << 12)
+    rng = np.random.default_rng(2)
+    voxels = VoxelMap(0.3, np.zeros(3))
+    voxels.add(rng.uniform([0, 0, 0], [150, 150, 0.3], (1_000_000, 3)))
+    count = len(voxels.sums()[0])
+    assert count > 200_000
+    tracemalloc.start()
+    kept = work(voxels)
+    peak = tracemalloc.get_traced_memory()[1] / count
+    tracemalloc.stop()
+    assert kept is not None  # it stays in memory until here
+    assert 0.7 * most < peak < most
 
 
 @pytest.mark.parametrize("voxel_m", [0.1, 0.3, 0.7])

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import zstandard
 
-from service.maps.byte_planes import read_records, write_records
+from service.maps.byte_planes import Columns, read_records, write_records
 
 RECORD = np.dtype([("cell", "<i4", (3,)), ("sum", "<f4")])
 
@@ -18,7 +18,7 @@ def records_of(count: int) -> np.ndarray:
 
 @pytest.mark.parametrize("count", [0, 1, 1000])
 def test_records_are_read_as_they_were_written(tmp_path: Path, count: int) -> None:
-    write_records(tmp_path / "r", records_of(count)[::-1])
+    write_records(tmp_path / "r", Columns.of(records_of(count)[::-1]))
     found = read_records(tmp_path / "r", RECORD)
     assert found.dtype == RECORD
     np.testing.assert_array_equal(found, records_of(count)[::-1])
@@ -26,7 +26,7 @@ def test_records_are_read_as_they_were_written(tmp_path: Path, count: int) -> No
 
 def test_a_file_of_cells_is_much_smaller_than_the_cells(tmp_path: Path) -> None:
     records = records_of(100_000)
-    write_records(tmp_path / "r", records)
+    write_records(tmp_path / "r", Columns.of(records))
     assert (tmp_path / "r").stat().st_size < 0.5 * records.nbytes
 
 
@@ -45,7 +45,7 @@ def test_a_file_of_cells_is_much_smaller_than_the_cells(tmp_path: Path) -> None:
     ],
 )
 def test_a_damaged_file_is_refused(tmp_path: Path, damage, what: str) -> None:
-    write_records(tmp_path / "r", records_of(50))
+    write_records(tmp_path / "r", Columns.of(records_of(50)))
     (tmp_path / "r").write_bytes(damage((tmp_path / "r").read_bytes()))
     with pytest.raises(ValueError, match=what):
         read_records(tmp_path / "r", RECORD)

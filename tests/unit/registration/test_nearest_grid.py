@@ -60,7 +60,9 @@ def random_surfels(seed, count, extent_m, apart_m):
 @settings(max_examples=30, deadline=None)
 def test_every_cell_holds_the_surfel_that_a_dense_grid_holds(seed, count, cell_m, reach_m, extent_m, apart_m):
     surfels = random_surfels(seed, count, extent_m, apart_m)
-    grid = nearest_grid(surfels, cell_m=cell_m, reach_m=reach_m)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(kernel, "_CHUNK", 7)  # several chunks, as in a large map
+        grid = nearest_grid(surfels, cell_m=cell_m, reach_m=reach_m)
     cells = cells_around(grid, surfels, reach_m)
     expected = dense_grid(surfels, cells, grid, reach_m)
     centres = grid.origin_m + (cells + 0.5) * cell_m
