@@ -15,6 +15,7 @@ from model_training.mapping.info import info_of
 from model_training.mapping.merge import merge_maps
 from model_training.mapping.tiled_care import diff_of_tiles, merge_tiled
 from model_training.mapping.update import update_map
+from model_training.mapping.update_tiled import update_tiled
 from model_training.mapping.verify import damage_of
 from service.errors import BundleError
 from service.maps.calibration import RigCorrection
@@ -167,14 +168,9 @@ def update(
     if replace and replace_area is not None:
         raise typer.BadParameter("give --replace or --replace-area, not both")
     require_map_first(bundle, dataset, "map update")
-    if (edge_m := read_manifest(bundle).tile_m) is not None:
-        raise BundleError(
-            f"{bundle}: a tiled map cannot be updated with a dataset; build a tiled map of the survey (`streetfix build-map {dataset} "
-            f"--tile-m {edge_m:g}` with the same encoder), and join both with `streetfix map merge`",
-            field="bundle",
-        )
+    updating = update_tiled if read_manifest(bundle).tiles else update_map
     with bars() as report:
-        made = update_map(
+        made = updating(
             bundle,
             Dataset(dataset),
             out,

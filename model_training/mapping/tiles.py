@@ -11,7 +11,7 @@ A tile reads three nested areas:
 """
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -126,7 +126,12 @@ def columns_and_rows(positions: NDArray[np.float64], tile_m: float) -> NDArray[n
 
 
 def tile_parts(
-    poses: NDArray[np.float64], kept: NDArray[np.int64], *, tile_m: float, between_m: float
+    poses: NDArray[np.float64],
+    kept: NDArray[np.int64],
+    *,
+    tile_m: float,
+    between_m: float,
+    also: Iterable[tuple[int, int]] = (),
 ) -> Iterator[TilePart]:
     """Yield the tiles of a survey that have a place, by column and row.
 
@@ -135,6 +140,7 @@ def tile_parts(
         kept: indices of the kept scans, ascending (P,).
         tile_m: edge of the tiles, metres.
         between_m: largest distance between two places, metres; 0 puts none between scans.
+        also: columns and rows of squares to yield without a place too. Their parts may have no scan.
 
     Raises:
         DatasetError: a pose is too far from the origin of the map frame.
@@ -149,7 +155,7 @@ def tile_parts(
     given_in = {square: len(found) for square, found in _grouped(columns_and_rows(poses[:, :3, 3], tile_m)).items()}
     around = range(-math.ceil(SCANS_MARGIN_M / tile_m), math.ceil(SCANS_MARGIN_M / tile_m) + 1)
     none = np.zeros(0, np.int64)
-    for column, row in sorted(scans_in.keys() | ways_in.keys()):
+    for column, row in sorted(scans_in.keys() | ways_in.keys() | set(also)):
         square = Square(column, row, tile_m)
         near = np.sort(np.concatenate([scans_in.get((column + x, row + y), none) for x in around for y in around]))
         order = near[square.within(SCANS_MARGIN_M, xy[near])]

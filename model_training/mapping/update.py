@@ -2,10 +2,11 @@
 
 import os
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from model_training.datasets.dataset import Dataset
 from model_training.mapping.area import Area, covered_by, polygon_of
@@ -22,12 +23,76 @@ from model_training.mapping.work import key_of, work_beside
 from service.errors import BundleError, DatasetError
 from service.maps.content import BundleContent
 from service.maps.manifest import Manifest
+from service.maps.map import Map
 from service.maps.reader import MapBundle
 from service.maps.writer import write_bundle
 from service.retrieval.encoder import Encoder
 
 #: Progress callback: stage, finished steps, all steps.
 Report = Callable[[str, int, int], None]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Replacement:
+    """What a survey replaces in a map.
+
+    Attributes:
+        covered: the part that it covered.
+        polygon: GeoJSON file of a polygon, metres, map frame; the part inside it. None for no polygon.
+        inside: the area of the polygon; None without one.
+    """
+
+    covered: bool
+    polygon: Path | None
+    inside: Area | None
+
+    @classmethod
+    def of(cls, covered: bool, polygon: Path | None) -> "Replacement":
+        """Read the polygon.
+
+        Args:
+            covered: replace the part that the survey covered.
+            polygon: GeoJSON file; None for no polygon.
+
+        Raises:
+            DatasetError: the file is not valid.
+        """
+        return cls(covered, polygon, None if polygon is None else polygon_of(polygon))
+
+    @property
+    def replaces(self) -> bool:
+        """Whether the survey replaces anything."""
+        return self.covered or self.polygon is not None
+
+    @property
+    def key(self) -> str:
+        """Text that identifies it in the key of a build."""
+        return str(self.covered) if self.polygon is None else self.polygon.read_text()
+
+    def require_places(self, T_map_lidar: NDArray[np.float64]) -> None:
+        """Refuse a polygon that the survey would leave empty.
+
+        Args:
+            T_map_lidar: poses of the scans that become places (P, 4, 4).
+
+        Raises:
+            DatasetError: no scan lies in the polygon.
+        """
+        if self.inside is not None and not self.inside(T_map_lidar[:, :2, 3]).any():
+            raise DatasetError(
+                f"{self.polygon}: no place of the new survey lies in the polygon, so the polygon would become empty; "
+                "draw a polygon around the new survey, in metres of the map frame",
+                field="area",
+            )
+
+    def area(self, points: NDArray[np.float64], track: NDArray[np.float64]) -> Area | None:
+        """Return the area that is replaced; None if nothing is.
+
+        Args:
+            points: means of the survey's voxels, metres, map frame (n, 3).
+            track: positions of its places and scans, metres, map frame (P, 3).
+        """
+        return self.inside if self.inside is not None or not self.covered else covered_by(points, track)
 
 
 def update_map(
@@ -68,14 +133,15 @@ def update_map(
     if out.exists() and not overwrite:
         raise BundleError(f"{out}: already exists; choose another --out, or pass --overwrite", field="out")
     bundle = MapBundle.open(old)
-    _require_frame(dataset, bundle)
-    area = None if replace_area is None else polygon_of(replace_area)
+    require_frame(dataset, bundle)
+    replacement = Replacement.of(replace_covered, replace_area)
     # Refuse contradicting streets before the work, not at its end.
-    joined_streets(streets_of_bundle(bundle), dataset.streets(), newer=replace_covered or area is not None)
+    joined_streets(streets_of_bundle(bundle), dataset.streets(), newer=replacement.replaces)
     settings = BuildSettings.of_map(bundle.manifest, passes_vote=passes_vote)
     threads = threads or os.cpu_count() or 1
     encoder = Encoder.open(bundle.encoder_bytes(), threads=threads)
     poses, kept = kept_scans(dataset, settings)
+    replacement.require_places(poses[kept])
     require_poses_within(empty_voxels_of(bundle), poses, dataset)
     key = key_of(
         dataset,
@@ -83,41 +149,75 @@ def update_map(
         settings,
         threads=threads,
         map=bundle.manifest.version,
-        replaced=_replaced_key(replace_covered, replace_area),
+        replaced=replacement.key,
     )
     with work_beside(out, key) as work:
         stages = ResumedStages(work, dataset, kept, settings, report)
-        _require_rows(stages.rows_seen(bundle.grid), bundle, dataset)
-        poses = stages.poses(poses)
-        drive = Drive(dataset, poses, kept, settings, encoder, bundle.grid, bundle.rows_seen)
-        cloud = voxels_of(bundle)
-        places, fresh = stages.places(drive, VoxelMap(cloud.voxel_m, cloud.origin))
-        if settings.traffic_vote:
-            dynamic = stages.dynamic_voxels(fresh, poses, each_scan=True)
-            fresh.keep(~np.isin(fresh.sums()[0], dynamic))
-        content = content_of(bundle)
-        if replace_covered or area is not None:
-            area = area or covered_by(fresh.means(), places.T_map_level[:, :3, 3])
-            content = _without(content, cloud, area, places, replace_area)
-        earlier = cloud.sums()[0].copy()
-        cloud.add_sums(*fresh.sums())
-        if passes_vote:
-            dynamic = stages.dynamic_voxels(cloud, poses, each_scan=False, earlier=earlier)
-            cloud.keep(~np.isin(cloud.sums()[0], dynamic))
-        whole = joined(content, _content(drive, places, content), newer_streets=area is not None)
+        require_rows(stages.rows_seen(bundle.grid), bundle, dataset)
+        drive = Drive(dataset, stages.poses(poses), kept, settings, encoder, bundle.grid, bundle.rows_seen)
+        content, cloud = updated(stages, drive, content_of(bundle), voxels_of(bundle), replacement)
         report("writing", 0, 2)
-        whole = with_cloud(replace(whole, tool_versions=tool_versions()), cloud)
+        whole = with_cloud(replace(content, tool_versions=tool_versions()), cloud)
         report("writing", 1, 2)
         manifest = write_bundle(out, whole, overwrite=overwrite)
         report("writing", 2, 2)
         return manifest
 
 
-def _replaced_key(replace_covered: bool, replace_area: Path | None) -> str:
-    return str(replace_covered) if replace_area is None else replace_area.read_text()
+def updated(
+    stages: ResumedStages, drive: Drive, content: BundleContent, cloud: VoxelMap, replacement: Replacement
+) -> tuple[BundleContent, VoxelMap]:
+    """Add a survey to the content of a map, or to that of a tile; return the new content, without a cloud, and its voxels.
+
+    Args:
+        stages: the stages of the build.
+        drive: the survey, or the part of it that belongs to a tile.
+        content: content of the map without its cloud.
+        cloud: voxels of the map. They are changed.
+        replacement: what the survey replaces.
+
+    Raises:
+        BundleError: streets or calibrations contradict each other.
+        DatasetError: a scan is damaged.
+    """
+    places, fresh = stages.places(drive, VoxelMap(cloud.voxel_m, cloud.origin))
+    if drive.settings.traffic_vote:
+        dynamic = stages.dynamic_voxels(fresh, drive.poses, each_scan=True)
+        fresh.keep(~np.isin(fresh.sums()[0], dynamic))
+    track = np.concatenate([places.T_map_level[:, :3, 3], drive.poses[drive.kept][:, :3, 3]])
+    area = replacement.area(fresh.means(), track)
+    if area is not None:
+        content = without(content, cloud, area)
+    earlier = cloud.sums()[0].copy()
+    cloud.add_sums(*fresh.sums())
+    if drive.settings.passes_vote:
+        dynamic = stages.dynamic_voxels(cloud, drive.poses, each_scan=False, earlier=earlier)
+        cloud.keep(~np.isin(cloud.sums()[0], dynamic))
+    return joined(content, _content(drive, places, content), newer_streets=replacement.replaces), cloud
 
 
-def _require_frame(dataset: Dataset, bundle: MapBundle) -> None:
+def without(content: BundleContent, cloud: VoxelMap, area: Area) -> BundleContent:
+    """Return the content of a map without its places in an area, and remove its voxels there from ``cloud``.
+
+    Args:
+        content: content of the map.
+        cloud: voxels of the map.
+        area: the area.
+    """
+    cloud.keep(~area(cloud.means()[:, :2]))
+    return of_places(content, ~area(content.T_map_place[:, :2, 3]))
+
+
+def require_frame(dataset: Dataset, bundle: Map) -> None:
+    """Refuse a survey in another frame than a map.
+
+    Args:
+        dataset: the dataset with the survey.
+        bundle: the map.
+
+    Raises:
+        DatasetError: the georeferences differ.
+    """
     of_map, of_drive = bundle.manifest.georeference, dataset.description.georeference
     if of_map != of_drive:
         raise DatasetError(
@@ -127,10 +227,18 @@ def _require_frame(dataset: Dataset, bundle: MapBundle) -> None:
         )
 
 
-def _require_rows(rows_seen: np.ndarray, bundle: MapBundle, dataset: Dataset) -> None:
+def require_rows(rows_seen: NDArray[np.bool_], bundle: Map, dataset: Dataset) -> None:
     """Refuse a survey whose LiDAR misses more than a tenth of the rows that the map uses.
 
     A few rows at the upper and lower edge depend on chance. With more missing rows, the views would look like those of another sensor.
+
+    Args:
+        rows_seen: True for the rows of the view grid that the survey's LiDAR covers (rows,).
+        bundle: the map.
+        dataset: the dataset with the survey, for the error message.
+
+    Raises:
+        DatasetError: too many rows are missing.
     """
     missing = int((bundle.rows_seen & ~rows_seen).sum())
     if missing > 0.1 * bundle.rows_seen.sum():
@@ -141,23 +249,9 @@ def _require_rows(rows_seen: np.ndarray, bundle: MapBundle, dataset: Dataset) ->
         )
 
 
-def _without(
-    content: BundleContent, cloud: VoxelMap, area: Area, places: Places, polygon: Path | None
-) -> BundleContent:
-    """Return the map without its places in the area, and remove its voxels there from ``cloud``."""
-    if not area(places.T_map_level[:, :2, 3]).any():
-        raise DatasetError(
-            f"{polygon}: no place of the new survey lies in the polygon, so the polygon would become empty; "
-            "draw a polygon around the new survey, in metres of the map frame",
-            field="area",
-        )
-    cloud.keep(~area(cloud.means()[:, :2]))
-    return of_places(content, ~area(content.T_map_place[:, :2, 3]))
-
-
 def _content(drive: Drive, places: Places, old: BundleContent) -> BundleContent:
     """Return the new traversal as a map of its own, with the encoder and the settings of the old map."""
-    lidar_height_m = float(np.median(places.height_m))
+    lidar_height_m = float(np.median(places.height_m)) if len(places.height_m) else old.parameters["lidar_height_m"]
     T_map_place = places.at_height(lidar_height_m)
     voted = {"passes_vote": 1.0} if drive.settings.passes_vote else {}
     return replace(
@@ -171,7 +265,7 @@ def _content(drive: Drive, places: Places, old: BundleContent) -> BundleContent:
         parameters={
             **{name: value for name, value in old.parameters.items() if name != "passes_vote"},
             "lidar_height_m": lidar_height_m,
-            "survey_scans": float(len(drive.poses)),
+            "survey_scans": float(len(drive.poses) if drive.part is None else drive.part.survey_scans),
             "places_between": float(places.between),
             **voted,
         },
