@@ -10,6 +10,7 @@ SECOND_STEPS ?= 4000
 THIRD_STEPS ?= 1500
 FOURTH_STEPS ?= 5000
 FIFTH_STEPS ?= 7000
+SIXTH_STEPS ?= 15000
 # Further steps on the paper's city, for the encoder that stands beside it in the report.
 PAPER_STEPS ?= 400
 # Real stereo frames in KITTI's object layout.
@@ -190,8 +191,10 @@ encoder: .venv/.torch ## train and export the stock encoder again; resumes an in
 	$(BIN)/streetfix train --recipe matched --run runs/third --turn 7.5 --steps $(THIRD_STEPS) --rate 6e-4 --seed 11 --start-from runs/second
 	$(BIN)/streetfix train --recipe rigs --run runs/fourth --turn 7.5 --steps $(FOURTH_STEPS) --rate 1e-3 --seed 13 --precision bfloat16 --start-from runs/third
 	$(BIN)/streetfix train --recipe rigs --run runs/fifth --turn 7.5 --steps $(FIFTH_STEPS) --rate 1e-3 --seed 17 --precision bfloat16 --start-from runs/fourth
-	$(BIN)/streetfix export runs/fifth --out runs/fifth/encoder.onnx
-	$(BIN)/streetfix quantize runs/fifth/encoder.onnx --cities 6 --seed 3 --out model_training/stock/encoder.onnx
+	$(BIN)/streetfix train --recipe streets --run runs/sixth --turn 7.5 --steps $(SIXTH_STEPS) --pairs 256 --rate 1e-3 --seed 19 --precision bfloat16 --start-from runs/fifth
+	$(BIN)/streetfix average runs/fifth runs/sixth --run runs/mean
+	$(BIN)/streetfix export runs/mean --out runs/mean/encoder.onnx
+	$(BIN)/streetfix quantize runs/mean/encoder.onnx --cities 6 --seed 3 --out model_training/stock/encoder.onnx
 
 calibration: .venv/.torch ## run the calibration cities and fit confidence again, for the stock encoder
 	$(BIN)/streetfix calibrate --anew $(ARGS)
