@@ -220,7 +220,7 @@ class Targets:
         Args:
             rows: rows of the voxels (m,).
         """
-        return self.numbers[self.tile[rows]]
+        return np.asarray(self.numbers[self.tile[rows]])
 
 
 def _positions_in(ascending: NDArray[np.int64], values: NDArray[np.int64]) -> NDArray[np.int64]:
