@@ -149,16 +149,6 @@ def test_info_of_a_tiled_map(halves: tuple[Path, Path]) -> None:
     assert "tiles:       2, 50 m wide" in out
 
 
-def test_an_update_of_a_tiled_map_names_the_commands_instead(
-    halves: tuple[Path, Path], small_dataset: Any, tmp_path: Path
-) -> None:
-    found = CliRunner().invoke(
-        app, ["update", str(halves[0]), str(small_dataset.folder), "--out", str(tmp_path / "new")]
-    )
-    assert isinstance(found.exception, BundleError)
-    assert "--tile-m 50` with the same encoder), and join both with `streetfix map merge`" in found.exception.message
-
-
 def test_verify_names_the_damaged_file_of_a_tile(halves: tuple[Path, Path], tmp_path: Path) -> None:
     assert damage_of(halves[0]) == []
     copy = tmp_path / "copy"
