@@ -1,5 +1,6 @@
 """Build one tile of a tiled map. The result depends on nothing but the task, so any process on any machine may build it."""
 
+import json
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -119,6 +120,7 @@ def key_of_tile(
         tile=repr(made_of),
         whole=repr(whole),
         calibration=calibration,
+        streets=json.dumps(dataset.streets(), sort_keys=True),
     )
 
 
@@ -150,7 +152,9 @@ def build_tile(task: TileTask, share: Share = lambda _: None) -> None:
         with work_beside(task.folder, task.key, wait_s=_WAIT_S) as work:
             if task.is_finished:  # by an earlier attempt that this one has just waited for
                 return
-            stages = ResumedStages(work, dataset, kept, task.settings, _shares(task.settings, share), task.part)
+            stages = ResumedStages(
+                work, dataset, kept, task.settings, shares_of_stages(task.settings, share), task.part
+            )
             drive = Drive(
                 dataset,
                 stages.poses(task.poses),
@@ -172,8 +176,13 @@ def build_tile(task: TileTask, share: Share = lambda _: None) -> None:
             )
 
 
-def _shares(settings: BuildSettings, share: Share) -> Callable[[str, int, int], None]:
-    """Return a progress callback of stages that reports the share of the tile."""
+def shares_of_stages(settings: BuildSettings, share: Share) -> Callable[[str, int, int], None]:
+    """Return a progress callback of stages that reports the share of the tile.
+
+    Args:
+        settings: settings of the map. They say which stages there are.
+        share: called with the finished share of the tile, 0 to 1.
+    """
     absent = {
         "survey": not settings.align_survey,
         "traffic": not settings.traffic_vote,

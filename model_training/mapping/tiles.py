@@ -150,7 +150,7 @@ def tile_parts(
     of_scan = columns_and_rows(xy, tile_m)
     scans_in = _grouped(of_scan)
     later, share = _on_way(T, between_m)
-    of_way = columns_and_rows((1 - share)[:, None] * xy[later - 1] + share[:, None] * xy[later], tile_m)
+    of_way = columns_and_rows(places_xy(T, between_m)[len(T) :], tile_m)
     ways_in = _grouped(of_way)
     given_in = {square: len(found) for square, found in _grouped(columns_and_rows(poses[:, :3, 3], tile_m)).items()}
     around = range(-math.ceil(SCANS_MARGIN_M / tile_m), math.ceil(SCANS_MARGIN_M / tile_m) + 1)
@@ -165,6 +165,18 @@ def tile_parts(
             on_way[k] = (*on_way.get(k, ()), float(share[way]))
         at_scan = (of_scan[order] == (column, row)).all(axis=1)
         yield TilePart(square, PlannedPlaces(at_scan, on_way), order, travelled[order], given_in.get((column, row), 0))
+
+
+def places_xy(T_map_lidar: NDArray[np.float64], between_m: float) -> NDArray[np.float64]:
+    """Return where a traversal gets its places: at its kept scans, then between distant ones, metres, map frame (P, 2).
+
+    Args:
+        T_map_lidar: poses of the kept scans in the order of the traversal (n, 4, 4).
+        between_m: largest distance between two places, metres; 0 puts none between scans.
+    """
+    xy = T_map_lidar[:, :2, 3]
+    later, share = _on_way(T_map_lidar, between_m)
+    return np.concatenate([xy, (1 - share)[:, None] * xy[later - 1] + share[:, None] * xy[later]])
 
 
 def _grouped(squares: NDArray[np.int64]) -> dict[tuple[int, int], NDArray[np.int64]]:

@@ -69,16 +69,16 @@ class Replacement:
         """Text that identifies it in the key of a build."""
         return str(self.covered) if self.polygon is None else self.polygon.read_text()
 
-    def require_places(self, T_map_lidar: NDArray[np.float64]) -> None:
+    def require_places(self, positions: NDArray[np.float64]) -> None:
         """Refuse a polygon that the survey would leave empty.
 
         Args:
-            T_map_lidar: poses of the scans that become places (P, 4, 4).
+            positions: of the new places, metres, map frame, (P, 2) or (P, 3).
 
         Raises:
-            DatasetError: no scan lies in the polygon.
+            DatasetError: none of them lies in the polygon.
         """
-        if self.inside is not None and not self.inside(T_map_lidar[:, :2, 3]).any():
+        if self.inside is not None and not self.inside(positions[:, :2]).any():
             raise DatasetError(
                 f"{self.polygon}: no place of the new survey lies in the polygon, so the polygon would become empty; "
                 "draw a polygon around the new survey, in metres of the map frame",
@@ -141,7 +141,6 @@ def update_map(
     threads = threads or os.cpu_count() or 1
     encoder = Encoder.open(bundle.encoder_bytes(), threads=threads)
     poses, kept = kept_scans(dataset, settings)
-    replacement.require_places(poses[kept])
     require_poses_within(empty_voxels_of(bundle), poses, dataset)
     key = key_of(
         dataset,
@@ -178,9 +177,11 @@ def updated(
 
     Raises:
         BundleError: streets or calibrations contradict each other.
-        DatasetError: a scan is damaged.
+        DatasetError: a scan is damaged, or a polygon has no place of the survey.
     """
     places, fresh = stages.places(drive, VoxelMap(cloud.voxel_m, cloud.origin))
+    if drive.part is None:  # a tile may have none in the polygon
+        replacement.require_places(places.T_map_level[:, :3, 3])
     if drive.settings.traffic_vote:
         dynamic = stages.dynamic_voxels(fresh, drive.poses, each_scan=True)
         fresh.keep(~np.isin(fresh.sums()[0], dynamic))

@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -19,7 +20,7 @@ from model_training.mapping.join import of_places
 from model_training.mapping.settings import BuildSettings
 from model_training.mapping.stored_map import content_of, voxels_of
 from model_training.mapping.tiles import TILE_MARGIN_M, Square
-from model_training.mapping.update_tiled import update_tiled
+from model_training.mapping.update_tiled import _without_places, update_tiled
 from model_training.mapping.verify import damage_of
 from model_training.mapping.work import work_folder
 from service.errors import BundleError, DatasetError
@@ -56,10 +57,10 @@ def in_this_process(_engine: str, tasks: Any, *, told: Any, **_: Any) -> None:
         build_tile(task, partial(told, index))
 
 
-def built(dataset: Dataset, encoder: Path, out: Path) -> Path:
+def built(dataset: Dataset, encoder: Path, out: Path, settings: BuildSettings = SETTINGS) -> Path:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(driver, "run", in_this_process)
-        build_tiled(dataset, encoder, out, SETTINGS, tile_m=TILE_M)
+        build_tiled(dataset, encoder, out, settings, tile_m=TILE_M)
     return out
 
 
@@ -81,10 +82,14 @@ def whole(small_dataset: Dataset, encoder_file: Path, folder: Path) -> Path:
 
 
 @pytest.fixture(scope="module")
-def half(small_dataset: Dataset, encoder_file: Path, folder: Path) -> Path:
-    """The map of the first half of the street."""
-    count = len(small_dataset.survey_poses())
-    return built(written(small_dataset, folder / "first", range(count // 2)), encoder_file, folder / "half")
+def first(small_dataset: Dataset, folder: Path) -> Dataset:
+    """The first half of the street."""
+    return written(small_dataset, folder / "first", range(len(small_dataset.survey_poses()) // 2))
+
+
+@pytest.fixture(scope="module")
+def half(first: Dataset, encoder_file: Path, folder: Path) -> Path:
+    return built(first, encoder_file, folder / "half")
 
 
 @pytest.fixture(scope="module")
@@ -229,13 +234,71 @@ def test_a_killed_update_keeps_its_finished_tiles(
     with pytest.raises(KeyboardInterrupt):
         update_tiled(whole, second, tmp_path / "m", threads=1)
     assert not (tmp_path / "m").exists()
-    kept = written_tiles.pop()
-    monkeypatch.setattr(
-        WRITE, lambda path, *rest: pytest.fail("finished") if path == kept else write_bundle(path, *rest)
-    )
+    first = written_tiles.copy()
+    written_tiles.clear()
+    monkeypatch.setattr(WRITE, lambda path, *rest: written_tiles.append(path) or write_bundle(path, *rest))
     made = update_tiled(whole, second, tmp_path / "m", threads=1)
+    assert len(written_tiles) == 1  # of two changed tiles
+    assert written_tiles != first
     assert made.version == expected.version
     assert not work_folder(tmp_path / "m").exists()
+
+
+def test_tiles_of_other_options_are_not_taken(
+    whole: Path, second: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A killed update without the vote is started again with it, then with another street."""
+    written_tiles: list[Path] = []
+
+    def dying(path: Path, *arguments: Any) -> Any:
+        written_tiles.append(path)
+        write_bundle(path, *arguments)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(WRITE, dying)
+    changed = shutil.copytree(second.folder, tmp_path / "more streets")
+    streets = json.loads((changed / "streets.geojson").read_text())
+    streets["features"][0]["properties"] |= {"id": "new", "name": "New street"}
+    (changed / "streets.geojson").write_text(json.dumps(streets))
+    for dataset, vote in ((second, False), (second, True), (Dataset(changed), True)):
+        with pytest.raises(KeyboardInterrupt):
+            update_tiled(whole, dataset, tmp_path / "m", passes_vote=vote, threads=1)
+    assert len(set(written_tiles)) == 3
+
+
+def test_the_usual_settings_work_on_tiles_too(
+    first: Dataset, second: Dataset, encoder_file: Path, tmp_path: Path
+) -> None:
+    """Alignment, traffic vote, places between scans and the vote of passes."""
+    usual = BuildSettings(name="town", headings=6, spacing_m=5.0, voxel_m=0.6, calibration=None)
+    built(first, encoder_file, tmp_path / "old", usual)
+    made = update_tiled(tmp_path / "old", second, tmp_path / "m", passes_vote=True, threads=1)
+    assert damage_of(tmp_path / "m") == []
+    assert made.counts.places > read_manifest(tmp_path / "old").counts.places
+    assert made.parameters["traffic_vote"] == made.parameters["survey_aligned"] == 1.0
+
+
+def test_a_new_tile_does_not_take_over_the_site_check_of_another(whole: Path, calibration_json: Any) -> None:
+    tile = content_of(MapBundle.open(tiles(whole)[FAR]))
+    site = {"offset": 0.1, "queries": 9, "right": 8, "expected_calibration_error": 0.01}
+    found = _without_places(replace(tile, calibration=calibration_json(site=site)))
+    assert found.calibration["site"] is None
+    assert found.parameters["survey_scans"] == 0.0
+    assert len(found.T_map_place) == 0
+
+
+@pytest.mark.parametrize(("name", "values"), [("voxel_m", (0.6, 0.3)), ("between_m", (0.0, 3.0))])
+def test_tiles_of_different_settings_are_refused(
+    whole: Path, second: Dataset, tmp_path: Path, name: str, values: tuple[float, float]
+) -> None:
+    content = content_of(MapBundle.open(tiles(whole)[FAR]))
+    for k, value in enumerate(values):
+        parameters = {**content.parameters, name: value}
+        write_bundle(tmp_path / f"{k}", replace(content, parameters=parameters))
+    write_tiled(tmp_path / "old", {(k, 0): tmp_path / f"{k}" for k in range(2)}, TILE_M, name="town")
+    with pytest.raises(BundleError, match=f"its tiles have different {name}") as refused:
+        update_tiled(tmp_path / "old", second, tmp_path / "m", threads=1)
+    assert refused.value.field == name
 
 
 def test_a_street_that_contradicts_the_maps_is_refused_before_the_work(
