@@ -142,8 +142,8 @@ WHY_MISSED: dict[str, Reason] = {
     "full.paper_city.stereo.street_accuracy": Reason(
         0.9281150,
         "219 of 3,130 answers are refused, 141 of them right. 8 accepted answers are more than 1 m off, and 6 are within 1 m across a "
-        "street border. Half of the refused right answers have a confidence of 0.72 or more, a tenth of them 0.87 or more. Tried: 60 numbers "
-        "(decision 0165), similarity at the pose and halves of the image (decision 0168), an encoder of small cities (decision 0171)",
+        "street border. Half of the refused right answers have a confidence of 0.72 or more, a tenth of them 0.87 or more. Tried: 60 "
+        "numbers (decision 0165), similarity at the pose and halves of the image (decision 0168), an encoder of small cities (0171)",
     ),
     "doubt.covariance_95_coverage": Reason(
         0.8581485,
