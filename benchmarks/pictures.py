@@ -113,7 +113,7 @@ def draw_map(bundle: MapBundle, runs: list[SavedRun], path: Path) -> None:
     errors, xy = position_errors(p), p.T_true[:, :2, 3]
     if bundle.cloud is None:
         raise ValueError(f"{bundle.path} has no cloud to draw")
-    surfels = bundle.cloud.surfels
+    surfels = bundle.cloud.unpacked(np.s_[:])
     walls = (surfels["xyz"][:, :2] + bundle.cloud.origin_m[:2])[np.abs(surfels["normal"][:, 2]) < 0.5]
     low, high = xy.min(axis=0) - 22, xy.max(axis=0) + 22
     # North points left: the street is long and the page is wide.

@@ -114,7 +114,7 @@ def make_cloud() -> SurfelMap:
     voxels = VoxelMap(0.3, np.round(T_map_camera[:3, 3]))
     for _ in range(3):  # so that every voxel has points enough for a normal
         voxels.add(transform_points(T_map_camera, points_camera))
-    return SurfelMap.prepare(voxels.origin, *voxels.surfels_by_tile())
+    return SurfelMap.prepare(voxels.origin, *voxels.surfels())
 
 
 def true_pose() -> NDArray[np.float64]:

@@ -127,7 +127,8 @@ def _of_registration(localizer: Localizer, cloud: SurfelMap, query: Query) -> di
     hits, near = raycaster.intersect(T, camera), raycaster._collections[0]
     _require_same((hits,), (plain.intersect(near.surfels, near.numbers, T, camera, settings.rays),))
     adjusted = rays._normal_equations(cloud, [picture], [hits], pose, settings.rays)
-    expected = plain.normal_equations(cloud.surfels, picture, hits, T, settings.rays)
+    surfels = cloud.unpacked(np.maximum(hits.ravel(), 0)).reshape(hits.shape)
+    expected = plain.normal_equations(surfels, picture, hits, T, settings.rays)
     np.testing.assert_allclose(adjusted.H, expected, rtol=1e-6, atol=1e-9 * np.abs(expected).max())
     return {
         "kernel.py: one step of all starts": _both(
@@ -139,7 +140,7 @@ def _of_registration(localizer: Localizer, cloud: SurfelMap, query: Query) -> di
         ),
         "rays.py: one step of the adjustment": _both(
             lambda: rays._normal_equations(cloud, [picture], [hits], pose, settings.rays),
-            lambda: plain.normal_equations(cloud.surfels, picture, hits, T, settings.rays),
+            lambda: plain.normal_equations(surfels, picture, hits, T, settings.rays),
         ),
     }
 

@@ -37,7 +37,7 @@ from service.registration.kernel import (
 from service.registration.points import PointSettings, blocks_of, inverse_depth_noise, points_of
 from service.registration.rays import RayPicture, RaySettings, adjust
 from service.registration.register import Registered
-from service.registration.surfel_map import TILE_M, SurfelMap
+from service.registration.surfel_map import SurfelMap
 from service.registration.visibility import SurfelRaycaster
 
 Floats = NDArray[np.float64]
@@ -111,13 +111,7 @@ def street(rng: np.random.Generator) -> SurfelMap:
     surfels["thickness_m"], surfels["points"] = rng.uniform(0, 0.1, len(surfels)), 5
     if rng.random() < 0.1:
         surfels = surfels[:1].copy()
-    tile = np.floor(surfels["xyz"][:, :2] / TILE_M)
-    order = np.lexsort(tile.T)
-    surfels, tile = surfels[order], tile[order]
-    keys, first, count = np.unique(tile, axis=0, return_index=True, return_counts=True)
-    tiles = np.column_stack([(keys + 0.5) * TILE_M, first, count]).astype(np.float64)
-    tiles = np.ascontiguousarray(tiles[np.argsort(tiles[:, 2])])
-    return SurfelMap.prepare(np.array([500.0, -300.0, 40.0]), surfels, tiles)
+    return SurfelMap.prepare(np.array([500.0, -300.0, 40.0]), surfels)
 
 
 def points_for(rng: np.random.Generator) -> QueryPoints:
@@ -206,7 +200,8 @@ def _align(rng: np.random.Generator, cloud: SurfelMap) -> list[NDArray[Any]]:
         patch = (np.arange(len(points)) // 7).astype(np.int32)
         found.append(gradients(cloud.grid, cloud.surfels, points, states[:1], OPTIONS, patch))
         del state
-    return [*found, cloud.grid.slots, cloud.grid.regions, cloud.grid.blocks, cloud.grid.nearest]
+    grid = cloud.grid
+    return [*found, cloud.surfels, grid.slots, grid.regions, grid.blocks, grid.nearest, grid.others]
 
 
 def _render(rng: np.random.Generator, cloud: SurfelMap, height: int, width: int) -> list[NDArray[Any]]:
@@ -214,9 +209,8 @@ def _render(rng: np.random.Generator, cloud: SurfelMap, height: int, width: int)
     camera = camera_of(rng, height, width)
     T = transform_from(rotation_of(rng) @ R_BODY_OPTICAL, rng.uniform(-20, 20, 3))
     drawn = render(
+        cloud.grid,
         cloud.surfels,
-        cloud.tiles,
-        tile_m=TILE_M,
         T_map_camera=T,
         camera=camera,
         size_m=rng.uniform(0.05, 2),

@@ -154,14 +154,17 @@ def surfels_of_cells(grid: NearestGrid, cells: NDArray[np.int64]) -> NDArray[np.
     at = np.minimum(np.searchsorted(grid.regions["key"], key), len(grid.regions) - 1)
     row = grid.regions["row"][at, block @ [REGION * REGION, REGION, 1]].astype(np.int64)
     inside &= (grid.regions["key"][at] == key) & (row > 0)
-    found = grid.blocks[np.where(inside, grid.regions["first"][at] + row - 1, 0)]
+    found = grid.blocks[np.where(inside, grid.regions["block"][at] + row - 1, 0)]
     part = np.asarray(cell // 4 @ [4, 2, 1], np.int64)[..., None]
     bit = (cell % 4 @ [16, 4, 1]).astype(np.uint64)
     filled = np.take_along_axis(found["filled"], part, axis=-1)[..., 0]
     inside &= (filled >> bit & np.uint64(1)) > 0
     before = np.take_along_axis(found["before"], part, axis=-1)[..., 0]
     entry = found["first"] + before + np.bitwise_count(filled & ((np.uint64(1) << bit) - np.uint64(1)))
-    return np.asarray(np.where(inside, grid.nearest[np.where(inside, entry, 0)], -1))
+    number = grid.nearest[np.where(inside, entry, 0)].astype(np.int64)
+    own, other, owned = (grid.regions[name].astype(np.int64)[at] for name in ("surfel", "other", "surfels"))
+    others = np.append(grid.others, np.int32(0))[np.where(inside & (number >= owned), other + number - owned, 0)]
+    return np.asarray(np.where(inside, np.where(number < owned, own + number, others), -1))
 
 
 def information(
@@ -171,7 +174,7 @@ def information(
 
     Args:
         grid: lookup grid of the map.
-        surfels: of the map, (S,) of ``SURFEL``.
+        surfels: of the map, (S,) of ``PACKED_SURFEL``.
         points: points of the query.
         states: starts, (n,) of ``STATE``.
         options: of the solver; the robust kernel has its last width.
@@ -187,7 +190,7 @@ def information(
     cell = np.floor((at - grid.origin_m) / grid.cell_m).astype(np.int64)
     found = surfels_of_cells(grid, cell)
     use = found >= 0
-    near = surfels[np.maximum(found, 0)]
+    near = grid.unpacked(surfels, np.maximum(found, 0).ravel()).reshape(found.shape)
     normal, off = near["normal"].astype(f64), at - near["xyz"]
     use &= (off**2).sum(axis=2) <= options.reach**2
     r, along_y = (normal * off).sum(axis=2), (normal * y).sum(axis=2)
@@ -262,7 +265,7 @@ def normal_equations(
     """Sum the normal equations (8, 8) of an image's inverse depths as ``streetfix_normal_equations`` does, at scale 1 and offset 0.
 
     Args:
-        surfels: of the map, (S,) of ``SURFEL``.
+        surfels: the surfel of each pixel, (H, W) of ``SURFEL``; any where ``surfel_of`` is -1.
         picture: image of inverse depths; its camera is the centre of rotation.
         surfel_of: index of the surfel in each pixel, -1 for none.
         T: T_map_camera, surfels' frame.
@@ -271,7 +274,7 @@ def normal_equations(
     camera, unit = picture.camera, 0.0 if picture.focal_baseline_px_m is None else 1 / picture.focal_baseline_px_m
     down, across = (-(-side // settings.patch) for side in (camera.height, camera.width))
     v, u = np.nonzero((surfel_of >= 0) & (picture.inverse > 0))
-    inverse, near = picture.inverse[v, u].astype(np.float64), surfels[surfel_of[v, u]]
+    inverse, near = picture.inverse[v, u].astype(np.float64), surfels[v, u]
     ray = np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones(len(u))], axis=1) @ T[:3, :3].T
     normal = near["normal"].astype(np.float64)
     along, off = (normal * ray).sum(axis=1), (normal * (near["xyz"] - T[:3, 3])).sum(axis=1)

@@ -77,7 +77,7 @@ def peer_rows(
     if cloud is None:
         raise ValueError(f"the map of {name} has no cloud")
     cloud = cloud.at(localizer.bundle.T_map_place[0, :3, 3])
-    points = cloud.origin_m + cloud.surfels["xyz"].astype(np.float64)
+    points = cloud.origin_m + cloud.unpacked(np.s_[:])["xyz"].astype(np.float64)
     map_points = thinned_to_voxels(points, 0.25)
 
     def add(peer: str, xy: NDArray[np.float64], seconds: float | None = None) -> None:

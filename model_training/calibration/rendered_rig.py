@@ -308,7 +308,9 @@ def render_query(cloud: SurfelMap, T_map_camera: Transform, rig: RigFile, rng: n
     chosen, group[seen] = np.unique(index[seen], return_inverse=True)
     rays = camera.rays_of_pixels()
     z[seen] = _depth_on_surfels(cloud, chosen, group[seen], rays[seen], T_map_camera, rng)
-    intensity[seen] = 1.0 if cloud.brightness is None else np.nan_to_num(cloud.brightness[chosen])[group[seen]]
+    intensity[seen] = (
+        1.0 if cloud.brightness is None else np.nan_to_num(cloud.brightness[chosen].astype(np.float32))[group[seen]]
+    )
     bright = float(np.median(intensity[intensity > 0])) if (intensity > 0).any() else 1.0
     for box in _new_objects(rig.camera.height_m, rng):
         hit = box.entered(rays)
@@ -347,7 +349,7 @@ def _depth_on_surfels(
     rng: np.random.Generator,
 ) -> NDArray[np.float64]:
     """Return the depth of rays (n, 3) on the planes of surfels; ``group`` is the row of each ray's surfel in ``chosen`` (n,)."""
-    surfels, R = cloud.surfels[chosen], T_map_camera[:3, :3]
+    surfels, R = cloud.unpacked(chosen), T_map_camera[:3, :3]
     normal = surfels["normal"].astype(np.float64) @ R
     centre = (surfels["xyz"].astype(np.float64) + cloud.origin_m - T_map_camera[:3, 3]) @ R
     centre += normal * (surfels["thickness_m"] * rng.normal(size=len(chosen)))[:, None]

@@ -95,10 +95,10 @@ def _told(report: Report, before: int, steps: int, done: int) -> None:
 def _align_once(scans: list[Stored], now: Poses, given: Poses, report: Callable[[int], None]) -> None:
     """Build the map of all scans and register each against it. The poses ``now`` change in place."""
     voxels, shared = _map_of(scans, now)
-    surfels, tiles, brightness = voxels.surfels_by_tile()
+    surfels, brightness = voxels.surfels()
     if not len(surfels):
         return
-    cloud = SurfelMap.prepare(voxels.origin, surfels, tiles, brightness)
+    cloud = SurfelMap.prepare(voxels.origin, surfels, brightness)
     for k, stored in enumerate(scans):
         points = _in_metres(stored)
         common = points[_are_of(voxels.keys_of(_placed(points, now[k])), shared)]

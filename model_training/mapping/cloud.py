@@ -11,7 +11,6 @@ from service.geometry.lengths import lengths
 from service.geometry.rigid import transform_points
 from service.heap import trim
 from service.maps.content import BundleContent
-from service.registration.kernel import SURFEL
 from service.registration.surfel_map import SurfelMap
 
 #: Largest range of a point in the cloud, metres.
@@ -37,8 +36,8 @@ def prepared(cloud: VoxelMap) -> SurfelMap | None:
     Args:
         cloud: the voxel map.
     """
-    surfels, tiles, brightness = cloud.surfels_by_tile()
-    found = SurfelMap.prepare(cloud.origin, surfels, tiles, brightness) if len(surfels) else None
+    surfels, brightness = cloud.surfels()
+    found = SurfelMap.prepare(cloud.origin, surfels, brightness) if len(surfels) else None
     trim()  # the grid is made of many small blocks at first
     return found
 
@@ -51,10 +50,9 @@ def with_cloud(content: BundleContent, cloud: VoxelMap) -> BundleContent:
         cloud: the voxel map of the cloud.
     """
     surfel_map = prepared(cloud)
-    surfels = np.zeros(0, SURFEL) if surfel_map is None else surfel_map.surfels
     return replace(
         content,
         cloud=surfel_map,
         statistics=None if surfel_map is None else cloud.columns(),
-        preview_webp=preview_webp(surfels, cloud.origin, content.T_map_place[:, :3, 3]),
+        preview_webp=preview_webp(surfel_map, content.T_map_place[:, :3, 3]),
     )

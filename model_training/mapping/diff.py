@@ -77,7 +77,7 @@ def _places(a: MapBundle, b: MapBundle) -> dict[str, Any]:
 def _positions(bundle: MapBundle) -> NDArray[np.float64]:
     if bundle.cloud is None:
         return np.zeros((0, 3))
-    return np.asarray(bundle.cloud.surfels["xyz"].astype(np.float64) + bundle.cloud.origin_m)
+    return np.asarray(bundle.cloud.unpacked(np.s_[:])["xyz"].astype(np.float64) + bundle.cloud.origin_m)
 
 
 def _reach_m(a: MapBundle, b: MapBundle) -> float:

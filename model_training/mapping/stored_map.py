@@ -103,7 +103,7 @@ def voxels_of(bundle: MapBundle) -> VoxelMap:
     if parts.STATISTICS_FILE in bundle.manifest.files:
         voxels.add_statistics(read_statistics(bundle))
     elif bundle.cloud is not None:
-        surfels = bundle.cloud.surfels
+        surfels = bundle.cloud.unpacked(np.s_[:])
         across = surfels["normal"].astype(np.float64)
         outer = across[:, :, None] * across[:, None, :]
         flat, thick = edge**2 / 12, surfels["thickness_m"].astype(np.float64)[:, None, None] ** 2

@@ -303,5 +303,5 @@ def _has_any(tile: Path, area: Area | None) -> bool:
         return False
     bundle = MapBundle.open(tile, verify=False)
     cloud = bundle.cloud
-    of_cloud = np.zeros((0, 2)) if cloud is None else cloud.surfels["xyz"][:, :2] + cloud.origin_m[:2]
+    of_cloud = np.zeros((0, 2)) if cloud is None else cloud.unpacked(np.s_[:])["xyz"][:, :2] + cloud.origin_m[:2]
     return bool(area(np.concatenate([bundle.T_map_place[:, :2, 3], of_cloud])).any())

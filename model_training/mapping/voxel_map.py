@@ -20,7 +20,6 @@ from service.compiled import load
 from service.errors import DatasetError
 from service.maps.byte_planes import Columns
 from service.registration.kernel import SURFEL
-from service.registration.surfel_map import TILE_M
 
 #: Library that the build compiles from ``voxels.c``.
 LIBRARY = Path(__file__).with_name("_voxels.so")
@@ -92,7 +91,7 @@ class Surfaces:
 
 
 class VoxelMap:
-    """Moments of points in voxels; ``surfels_by_tile`` computes the surfels.
+    """Moments of points in voxels; ``surfels`` computes the surfels.
 
     The number of keys limits the reach (``reach_m``): 157 km from the origin along each axis with voxels of 0.3 m. A method that adds
     points beyond it raises ``DatasetError``.
@@ -363,36 +362,23 @@ class VoxelMap:
         del around
         return Surfaces(np.flatnonzero(enough).astype(np.int32), normals, thickness)
 
-    def surfels_by_tile(self) -> tuple[NDArray[Any], NDArray[np.float64], NDArray[np.float32]]:
-        """Compute the surfels, sorted by tile, in the format of ``SurfelMap.prepare``.
+    def surfels(self) -> tuple[NDArray[Any], NDArray[np.float32]]:
+        """Compute the surfels, in the format of ``SurfelMap.prepare``.
 
         The positions are float32. Their resolution is 0.1 mm up to 1 km from the origin, and 1 mm up to 16 km. The surfels are filled in a
         part at a time: a map of five million surfels has no room for copies.
 
         Returns:
-            Surfels (n,) of ``SURFEL`` with positions relative to ``origin``; tiles (T, 4): centre x, y (metres, same frame), first surfel
-            and number of surfels; brightness of each surfel (n,).
+            Surfels (n,) of ``SURFEL`` with positions relative to ``origin``, and the brightness of each surfel (n,).
         """
         found = self.surfaces()
-        tiles, tile = ranked(len(found.rows), lambda part: self._tiles_of(found.rows[part]))
-        order = np.argsort(tile, kind="stable")
-        first = np.searchsorted(tile, np.arange(len(tiles) + 1), sorter=order)
-        rows = found.rows[order]
-        del order, tile
-        surfels, brightness = np.zeros(len(rows), SURFEL), np.empty(len(rows), np.float32)
-        for part in parts(len(rows)):
-            of = rows[part]
+        surfels, brightness = np.zeros(len(found.rows), SURFEL), np.empty(len(found.rows), np.float32)
+        for part in parts(len(found.rows)):
+            of = found.rows[part]
             surfels["xyz"][part] = self.means_of(of) - self.origin
             surfels["normal"][part], surfels["thickness_m"][part] = found.normals[of], found.thickness_m[of]
             surfels["points"][part], brightness[part] = self._moments[of, 0], self._brightness_of(of)
-        column = np.rint(tiles / SPAN)
-        corners = np.stack([column, tiles - column * SPAN], axis=1)
-        return surfels, np.c_[(corners + 0.5) * TILE_M, first[:-1], np.diff(first)], brightness
-
-    def _tiles_of(self, rows: NDArray[np.int32]) -> NDArray[np.int64]:
-        """Return the number of the tile of each voxel (n,): column times ``SPAN``, plus row."""
-        x, y = np.floor((self.means_of(rows)[:, :2] - self.origin[:2]) / TILE_M).astype(np.int64).T
-        return np.asarray(x * SPAN + y)  # both are far below SPAN / 2
+        return surfels, brightness
 
     def _brightness_of(self, rows: NDArray[np.int32]) -> NDArray[np.float32]:
         bright, told = (self._moments[rows, column] for column in (_BRIGHT.start, _BRIGHT.start + 1))

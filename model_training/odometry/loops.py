@@ -140,7 +140,7 @@ def _cloud(drive: Drive, middle: Keyframe, settings: LoopSettings) -> SurfelMap:
     low, high = max(0, middle.index - settings.around), middle.index + settings.around + 1
     for keyframe in drive.keyframes[low:high]:
         voxels.add(transform_points(keyframe.T_first_lidar, drive.points(keyframe.index).astype(np.float64)))
-    return SurfelMap.prepare(voxels.origin, *voxels.surfels_by_tile())
+    return SurfelMap.prepare(voxels.origin, *voxels.surfels())
 
 
 def _query_points(drive: Drive, keyframe: Keyframe, settings: LoopSettings) -> QueryPoints:

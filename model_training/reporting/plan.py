@@ -45,8 +45,11 @@ class Plan:
         xy, upright = places, np.zeros(0, bool)
         drawn = () if bundle.cloud is None else bundle.cloud.parts(_MOST_TILES)
         if any(len(part.surfels) for part in drawn):
-            xy = np.concatenate([part.surfels["xyz"][:, :2] + part.origin_m[:2] for part in drawn])
-            upright = np.concatenate([np.abs(part.surfels["normal"][:, 2]) < _UPRIGHT for part in drawn])
+            surfels = [part.unpacked(np.s_[:]) for part in drawn]
+            xy = np.concatenate(
+                [own["xyz"][:, :2] + part.origin_m[:2] for own, part in zip(surfels, drawn, strict=True)]
+            )
+            upright = np.abs(np.concatenate(surfels)["normal"][:, 2]) < _UPRIGHT
         low = np.minimum(xy.min(axis=0), places.min(axis=0)) - _MARGIN_M
         high = np.maximum(xy.max(axis=0), places.max(axis=0)) + _MARGIN_M
         size = high - low

@@ -21,13 +21,13 @@ def events_of_map(bundle: Map, *, most_points: int) -> Iterator[Event]:
     """
     drawn = () if bundle.cloud is None else bundle.cloud.parts(MOST_TILES)
     for number, part in enumerate(drawn):
-        surfels = part.surfels[:: max(1, -(-len(part.surfels) * len(drawn) // most_points))]
+        surfels = part.unpacked(np.s_[:: max(1, -(-len(part.surfels) * len(drawn) // most_points))])
         upright = 1 - np.abs(surfels["normal"][:, 2])
         yield Cloud(
             "map/cloud" if len(drawn) == 1 else f"map/cloud/{number}",
             None,
             part.origin_m,
-            surfels["xyz"].astype(np.float32),
+            surfels["xyz"],
             (90 + 150 * upright).astype(np.uint8),
         )
     yield Track("map/places", None, bundle.T_map_place[:, :3, 3])

@@ -3,12 +3,12 @@
 import struct
 import threading
 from collections import OrderedDict
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from service.maps.map import Map
+from service.registration.surfel_map import SurfelMap
 from service.registration.surfel_tiles import Cloud
 
 #: ``points`` is rounded down to one of these, so that few clouds are computed and kept.
@@ -63,7 +63,7 @@ def cloud_bytes(cloud: Cloud | None, most: int) -> bytes:
         return CLOUD_MAGIC + struct.pack("<I6d", 0, *(0.0,) * 3, *(1.0,) * 3)
     origin_m, xyz, upright = parts[0].origin_m, [], []
     for part in parts:
-        chosen = part.surfels[thinned(part.surfels, part.tiles, most // len(parts))]
+        chosen = part.unpacked(thinned(part, most // len(parts)))
         xyz.append(chosen["xyz"] if part is parts[0] else chosen["xyz"] + (part.origin_m - origin_m))
         upright.append(_STEPS * (1.0 - np.clip(np.abs(chosen["normal"][:, 2]), 0, 1)))
     positions = np.concatenate(xyz)
@@ -76,23 +76,25 @@ def cloud_bytes(cloud: Cloud | None, most: int) -> bytes:
     return CLOUD_MAGIC + struct.pack("<I6d", len(rows), *(origin_m + low), *step) + packed.tobytes()
 
 
-def thinned(surfels: NDArray[Any], tiles: NDArray[np.float64], most: int) -> NDArray[np.intp]:
+def thinned(cloud: SurfelMap, most: int) -> NDArray[np.intp]:
     """Return rows of surfels with an even density: one surfel of each cell of a lattice.
 
-    It works tile by tile, so a map may be larger than the memory.
+    It works region by region of the grid, so a map may be larger than the memory.
 
     Args:
-        surfels: surfels of the map, sorted by tile.
-        tiles: tiles of the map, with the first surfel and the count in the last two columns.
+        cloud: surfel map.
         most: most rows.
     """
+    surfels, cubes = cloud.surfels, cloud.grid.cubes
     if len(surfels) <= most:
         return np.arange(len(surfels))
     # Surfaces are two-dimensional, so half of the points need a cell that is larger by the square root of two.
-    cell_m = _spacing_m(surfels, tiles) * float(np.sqrt(len(surfels) / most))
+    cell_m = _spacing_m(cloud) * float(np.sqrt(len(surfels) / most))
     kept = []
-    for first, count in tiles[:, 2:].astype(np.intp):
-        cell = np.floor(surfels["xyz"][first : first + count] / cell_m).astype(np.int64)
+    for first, count in zip(cubes["first"].tolist(), cubes["count"].tolist(), strict=True):
+        if not count:
+            continue
+        cell = np.floor(cloud.unpacked(slice(first, first + count))["xyz"] / cell_m).astype(np.int64)
         cell -= cell.min(axis=0, initial=0)
         across = cell.max(axis=0, initial=0) + 1
         key = (cell[:, 0] * across[1] + cell[:, 1]) * across[2] + cell[:, 2]
@@ -102,10 +104,10 @@ def thinned(surfels: NDArray[Any], tiles: NDArray[np.float64], most: int) -> NDA
     return np.concatenate(kept)
 
 
-def _spacing_m(surfels: NDArray[Any], tiles: NDArray[np.float64]) -> float:
-    """Return the spacing of neighbouring surfels in the fullest tile, m: the edge of a cell with about one surfel."""
-    first, count = tiles[int(np.argmax(tiles[:, 3])), 2:].astype(np.intp)
-    xyz = surfels["xyz"][first : first + count]
+def _spacing_m(cloud: SurfelMap) -> float:
+    """Return the spacing of neighbouring surfels in the fullest region, m: the edge of a cell with about one surfel."""
+    _, first, count = cloud.grid.cubes[int(np.argmax(cloud.grid.cubes["count"]))].item()
+    xyz = cloud.unpacked(slice(first, first + count))["xyz"]
     for cell_m in (0.1, 0.2, 0.3, 0.4, 0.6, 0.8):
         occupied = len(np.unique(np.floor(xyz / cell_m).astype(np.int32), axis=0))
         if occupied < 0.8 * count:

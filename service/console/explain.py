@@ -17,7 +17,7 @@ from service.localization.refine import RefineSettings
 from service.maps.map import Map
 from service.registration.kernel import render
 from service.registration.register import Registered
-from service.registration.surfel_map import TILE_M, SurfelMap
+from service.registration.surfel_map import SurfelMap
 from service.retrieval.query import Query
 from service.retrieval.retrieve import EncodedFrame
 from service.runtime.engine import EncodedQuery, Engine, Located
@@ -143,9 +143,7 @@ def camera_over(grid: ViewGrid) -> PinholeCamera:
 
 def _drawn_map(cloud: SurfelMap, T_map_camera: Transform, camera: PinholeCamera) -> Float32[NDArray[np.float32], "H W"]:
     T = transform_from(T_map_camera[:3, :3], T_map_camera[:3, 3] - cloud.origin_m)
-    return render(
-        cloud.surfels, cloud.tiles, tile_m=TILE_M, T_map_camera=T, camera=camera, size_m=SURFEL_M, reach_m=REACH_M
-    )
+    return render(cloud.grid, cloud.surfels, T_map_camera=T, camera=camera, size_m=SURFEL_M, reach_m=REACH_M)
 
 
 def _scaled(query: Query) -> PinholeCamera:

@@ -28,11 +28,13 @@ typedef struct {
     uint16_t before[PARTS]; /* number of filled cells in the parts before each part */
 } Block;
 
-/* A region with at least one block. */
+/* A region with at least one block or surfel. Its cells refer to surfels by numbers of the region: first its own surfels, then those of
+ * other regions that are in ``others``. */
 typedef struct {
-    int64_t key;                /* numbers of the region along x, y, z: (x << 36) + (y << 18) + z */
-    int64_t first;              /* row of the region's first block in blocks */
-    uint16_t row[REGION_BLOCKS]; /* row of each block, counted from first, plus 1; 0 for none */
+    int64_t key;                 /* numbers of the region along x, y, z: (x << 36) + (y << 18) + z */
+    int64_t block, surfel, other; /* rows of the region's first block in blocks, surfel in surfels, and entry in others */
+    uint32_t surfels, others;    /* number of its surfels, and of its entries in others */
+    uint16_t row[REGION_BLOCKS]; /* row of each block, counted from ``block``, plus 1; 0 for none */
 } Region;
 
 typedef struct {
@@ -41,7 +43,9 @@ typedef struct {
     const int32_t *slots;    /* hash table with linear probing: row of a region in regions, -1 for none */
     const Region *regions;
     const Block *blocks;
-    const int32_t *nearest;  /* of each filled cell: index of the surfel nearest to its centre */
+    const void *nearest;   /* of each filled cell: number of the surfel nearest to its centre (uint16_t or uint32_t) */
+    int64_t nearest_bytes; /* size of such a number: 2 or 4 */
+    const int32_t *others; /* rows in surfels */
 } Grid;
 
 /* Each array is padded with zeros to whole batches (BATCH_SIZE). */
@@ -73,7 +77,6 @@ typedef struct {
     double iterations, converged, error;
 } State;
 
-#define HEIGHT 60.0 /* m: how far surfaces may rise above or fall below the camera (streetfix_render) */
 #define SETTLED_M 1e-3 /* a pose has converged if its last step was smaller than this, m, */
 #define SETTLED_RAD 1.7e-3 /* and turned it by less than this, rad (0.1 degrees) */
 /* Points per batch. Their memory is prefetched together. Otherwise the kernel would mostly wait for memory (decision 0025). */
@@ -129,7 +132,10 @@ static void rotate_left(double R[9], const double w_in[3])
 /* A batch of points: their positions, surfels, gradients, residuals and weights. */
 typedef struct {
     double y[3][BATCH_SIZE], at[3][BATCH_SIZE], stretch[BATCH_SIZE]; /* R y, and R y + t (surfels' frame, m); s / (1 + o q) */
-    const Surfel *surfel[BATCH_SIZE]; /* 0 for none */
+    float local[3][BATCH_SIZE];             /* position in the region, steps */
+    const PackedSurfel *surfel[BATCH_SIZE]; /* 0 for none */
+    /* distance from the surfel (surfels' frame, m), its normal, its thickness (m); 0, 0 0 1 and 1 for none */
+    float off[3][BATCH_SIZE], normal[3][BATCH_SIZE], thickness[BATCH_SIZE];
     /* gradient of the residual, residual, weight; matched: 1 if a surfel is in reach, otherwise 0 */
     double gradient[UNKNOWNS][BATCH_SIZE], r[BATCH_SIZE], w[BATCH_SIZE], matched[BATCH_SIZE];
 } Batch;
@@ -173,14 +179,23 @@ static inline int64_t key_of(int64_t x, int64_t y, int64_t z)
     return (x << 2 * KEY_BITS) + (y << KEY_BITS) + z;
 }
 
-/* Finds the entries in ``nearest`` of the cells that hold some points: ``at`` (3, BATCH_SIZE), surfels' frame, m. 0 for a cell that is not
- * filled. */
-static inline void find_cells(const Grid *g, double at[3][BATCH_SIZE], int64_t count, Recent *recent, const int32_t **cells)
+/* Row of the surfel that an entry of ``nearest`` refers to. */
+static inline int64_t row_of(const Grid *g, const Region *region, int64_t entry)
+{
+    const int64_t number = g->nearest_bytes == 2 ? ((const uint16_t *)g->nearest)[entry] : ((const uint32_t *)g->nearest)[entry];
+    return number < region->surfels ? region->surfel + number : g->others[region->other + number - region->surfels];
+}
+
+/* Finds the surfels that the cells at some positions refer to: ``at`` (3, BATCH_SIZE), surfels' frame, m. Writes their rows, -1 for a cell
+ * that is not filled, and the positions in their regions, steps. */
+static inline void find_cells(const Grid *g, double at[3][BATCH_SIZE], int64_t count, Recent *recent, float local[3][BATCH_SIZE],
+                              int64_t *rows)
 {
     int32_t in[3][BATCH_SIZE], recent_entry[BATCH_SIZE], number[BATCH_SIZE], part[BATCH_SIZE], bit[BATCH_SIZE];
     int64_t keys[BATCH_SIZE];
     const Region *regions[BATCH_SIZE];
     const Block *blocks[BATCH_SIZE];
+    int64_t cells[BATCH_SIZE];
     /* For values >= 0 truncation equals floor(), which is a slow call on plain x86-64 (decision 0025). Values outside the numbered regions
      * and NaN become -1, which is no cell. */
     const double origin[3] = {g->ox, g->oy, g->oz}, scale = 1.0 / g->cell;
@@ -190,6 +205,7 @@ static inline void find_cells(const Grid *g, double at[3][BATCH_SIZE], int64_t c
             cell = cell >= 0 ? cell : -1.0;
             cell = cell < (double)(REGION_EDGE << KEY_BITS) ? cell : -1.0;
             in[a][k] = (int32_t)cell;
+            local[a][k] = (float)((cell - (double)(in[a][k] & ~(REGION_EDGE - 1))) * STEPS);
         }
     for (int k = 0; k < BATCH_SIZE; k++) {
         const uint32_t outside = (uint32_t)((in[0][k] | in[1][k] | in[2][k]) >> 31);
@@ -213,23 +229,52 @@ static inline void find_cells(const Grid *g, double at[3][BATCH_SIZE], int64_t c
     }
     for (int64_t k = 0; k < count; k++) {
         const int64_t row = regions[k]->row[number[k]];
-        blocks[k] = row ? g->blocks + regions[k]->first + row - 1 : &EMPTY_BLOCK;
+        blocks[k] = row ? g->blocks + regions[k]->block + row - 1 : &EMPTY_BLOCK;
         __builtin_prefetch(blocks[k]->filled + part[k]);
         __builtin_prefetch(&blocks[k]->first);
     }
     for (int64_t k = 0; k < count; k++) {
         const uint64_t filled = blocks[k]->filled[part[k]], cell = (uint64_t)1 << bit[k];
-        const int32_t *entry = g->nearest + blocks[k]->first + blocks[k]->before[part[k]] + __builtin_popcountll(filled & (cell - 1));
-        __builtin_prefetch(entry);
-        cells[k] = filled & cell ? entry : 0;
+        const int64_t entry = blocks[k]->first + blocks[k]->before[part[k]] + __builtin_popcountll(filled & (cell - 1));
+        __builtin_prefetch((const char *)g->nearest + entry * g->nearest_bytes);
+        cells[k] = filled & cell ? entry : -1;
+    }
+    for (int64_t k = 0; k < count; k++) rows[k] = cells[k] < 0 ? -1 : row_of(g, regions[k], cells[k]);
+}
+
+/* Unpacks the surfels of a batch. A surfel of another region is less than half a region away, so the nearest of the positions that have
+ * its steps is meant. */
+static inline void unpack(Batch *b, double cell)
+{
+    static const PackedSurfel none = {{0, 0, 0}, {0, 0}, 0, 0}; /* faces up */
+    float packed[5][BATCH_SIZE];
+    for (int k = 0; k < BATCH_SIZE; k++) {
+        const PackedSurfel *m = b->surfel[k] ? b->surfel[k] : &none;
+        packed[0][k] = m->xyz[0], packed[1][k] = m->xyz[1], packed[2][k] = m->xyz[2];
+        packed[3][k] = m->normal[0], packed[4][k] = m->normal[1];
+        b->thickness[k] = b->surfel[k] ? unpack_thickness(m->thickness) : 1; /* avoids a variance of 0 */
+        b->matched[k] = b->surfel[k] != 0;
+    }
+    const float step = (float)(cell / STEPS), half = CUBE_STEPS / 2;
+    for (int a = 0; a < 3; a++)
+        for (int k = 0; k < BATCH_SIZE; k++) {
+            float off = b->local[a][k] - packed[a][k];
+            off = off > half ? off - CUBE_STEPS : off;
+            off = off < -half ? off + CUBE_STEPS : off;
+            b->off[a][k] = off * step;
+        }
+    for (int k = 0; k < BATCH_SIZE; k++) { /* as unpack_normal */
+        const float x = packed[3][k], y = packed[4][k], z = (float)NORMAL_STEPS - fabsf(x) - fabsf(y), fold = z < 0 ? -z : 0.0f;
+        const float ux = x + (x < 0 ? fold : -fold), uy = y + (y < 0 ? fold : -fold), scale = 1.0f / sqrtf(ux * ux + uy * uy + z * z);
+        b->normal[0][k] = ux * scale, b->normal[1][k] = uy * scale, b->normal[2][k] = z * scale;
     }
 }
 
 /* Positions of the points first .. first + count - 1 in the surfels' frame, and their nearest surfels. */
-static inline void find_surfels(const Grid *g, const Surfel *surfels, const Query *q, const State *s, double e_scale, int64_t first,
+static inline void find_surfels(const Grid *g, const PackedSurfel *surfels, const Query *q, const State *s, double e_scale, int64_t first,
                                 int64_t count, Recent *recent, Batch *b)
 {
-    const int32_t *cells[BATCH_SIZE];
+    int64_t rows[BATCH_SIZE];
     for (int k = 0; k < BATCH_SIZE; k++) b->stretch[k] = e_scale / (1.0 + s->offset * q->q[first + k]);
     for (int k = 0; k < BATCH_SIZE; k++) {
         const double px = b->stretch[k] * q->xyz[0][first + k], py = b->stretch[k] * q->xyz[1][first + k];
@@ -239,12 +284,13 @@ static inline void find_surfels(const Grid *g, const Surfel *surfels, const Quer
             b->at[a][k] = b->y[a][k] + s->t[a];
         }
     }
-    find_cells(g, b->at, count, recent, cells);
+    find_cells(g, b->at, count, recent, b->local, rows);
     for (int64_t k = 0; k < count; k++) {
-        b->surfel[k] = cells[k] ? surfels + *cells[k] : 0;
+        b->surfel[k] = rows[k] < 0 ? 0 : surfels + rows[k];
         if (b->surfel[k]) __builtin_prefetch(b->surfel[k]);
     }
     for (int64_t k = count; k < BATCH_SIZE; k++) b->surfel[k] = 0;
+    unpack(b, g->cell);
 }
 
 /* Adds the priors: position and height near the anchor, upright on the ground, log scale and disparity offset near 0. ``n`` is the summed
@@ -286,24 +332,12 @@ static void add_priors(const Options *o, const State *s, double n, double H[UNKN
 /* Computes gradients, residuals and weights of a batch. The weight is 0 if no surfel is in reach. */
 static inline void linearise(const Query *q, const Options *o, const State *s, double robust, double e_scale, int64_t first, Batch *b)
 {
-    double n[3][BATCH_SIZE], off[3][BATCH_SIZE], thickness[BATCH_SIZE];
-    for (int k = 0; k < BATCH_SIZE; k++) {
-        const Surfel *m = b->surfel[k];
-        b->matched[k] = m != 0;
-        if (!m) {
-            n[0][k] = n[1][k] = off[0][k] = off[1][k] = off[2][k] = 0;
-            n[2][k] = thickness[k] = 1; /* avoids a variance of 0 */
-            continue;
-        }
-        n[0][k] = m->normal[0], n[1][k] = m->normal[1], n[2][k] = m->normal[2];
-        off[0][k] = b->at[0][k] - m->xyz[0], off[1][k] = b->at[1][k] - m->xyz[1], off[2][k] = b->at[2][k] - m->xyz[2];
-        thickness[k] = m->thickness_m;
-    }
     const float *rx = q->ray[0] + first, *ry = q->ray[1] + first, *rz = q->ray[2] + first;
     const float *sigma = q->sigma + first, *weight = q->weight + first, *depth = q->q + first;
     const double reach2 = o->reach * o->reach, surface2 = o->surface * o->surface, robust2 = robust * robust;
     for (int k = 0; k < BATCH_SIZE; k++) {
-        const double dx = off[0][k], dy = off[1][k], dz = off[2][k], nx = n[0][k], ny = n[1][k], nz = n[2][k];
+        const double dx = b->off[0][k], dy = b->off[1][k], dz = b->off[2][k];
+        const double nx = b->normal[0][k], ny = b->normal[1][k], nz = b->normal[2][k], thickness = b->thickness[k];
         const double y0 = b->y[0][k], y1 = b->y[1][k], y2 = b->y[2][k];
         const double there = b->matched[k], use = dx * dx + dy * dy + dz * dz > reach2 ? 0.0 : there;
         const double r = nx * dx + ny * dy + nz * dz;
@@ -324,10 +358,10 @@ static inline void linearise(const Query *q, const Options *o, const State *s, d
         ratio = ratio < 0.5 ? 0.5 : ratio;
         ratio = ratio > 2 ? 2 : ratio;
         const double along = sigma[k] * c;
-        const double variance = along * along * ratio * ratio * ratio + surface2 + thickness[k] * thickness[k];
+        const double variance = along * along * ratio * ratio * ratio + surface2 + thickness * thickness;
         /* The weight needs ratio^3, like the gradient in 1 / range. The robust width needs ratio^2, which is even in the error of
          * 1 / range. With ratio^3 the kernel is too slow to reject points that are measured too near (decision 0081). */
-        const double even = along * along * ratio * ratio + surface2 + thickness[k] * thickness[k];
+        const double even = along * along * ratio * ratio + surface2 + thickness * thickness;
         const double k2 = 4 * even + robust2, damp = k2 / (k2 + r * r);
         b->r[k] = r;
         b->w[k] = use * weight[k] * damp * damp / variance;
@@ -343,7 +377,7 @@ static inline void add_products(const double *one, const double *other, double *
     for (int l = 0; l < LANES; l++) sums[l] += own[l];
 }
 
-static inline void align_one(const Grid *g, const Surfel *surfels, const Query *q, const Options *o, Recent *recent, State *s)
+static inline void align_one(const Grid *g, const PackedSurfel *surfels, const Query *q, const Options *o, Recent *recent, State *s)
 {
     Batch batch;
     double total_weight = 0;
@@ -394,8 +428,8 @@ static inline void align_one(const Grid *g, const Surfel *surfels, const Query *
 
 /* Share of the points on the map. Precise points weigh more. A point counts by exp(-r^2 / (2 variance)) of its distance r to the surface,
  * not by a hard threshold. */
-static inline void score_one(const Grid *g, const Surfel *surfels, const Query *q, double tolerance, double height_min, Recent *recent,
-                             State *s)
+static inline void score_one(const Grid *g, const PackedSurfel *surfels, const Query *q, double tolerance, double height_min,
+                             Recent *recent, State *s)
 {
     Batch batch;
     double inliers = 0, total = 0, e_scale = exp(s->log_scale);
@@ -408,13 +442,12 @@ static inline void score_one(const Grid *g, const Surfel *surfels, const Query *
             if (batch.y[2][k] < height_min) continue;
             double w = q->weight[i] / (1 + 4 * sigma * sigma);
             total += w;
-            const Surfel *m = batch.surfel[k];
-            if (!m) continue;
-            double dx = batch.at[0][k] - m->xyz[0], dy = batch.at[1][k] - m->xyz[1], dz = batch.at[2][k] - m->xyz[2];
+            if (!batch.surfel[k]) continue;
+            double dx = batch.off[0][k], dy = batch.off[1][k], dz = batch.off[2][k];
             if (dx * dx + dy * dy + dz * dz > 1.0 + 4 * sigma * sigma) continue;
-            double r = m->normal[0] * dx + m->normal[1] * dy + m->normal[2] * dz, c = 0;
+            double r = batch.normal[0][k] * dx + batch.normal[1][k] * dy + batch.normal[2][k] * dz, c = 0;
             for (int a = 0; a < 3; a++)
-                c += m->normal[a] * (s->R[3 * a] * q->ray[0][i] + s->R[3 * a + 1] * q->ray[1][i] + s->R[3 * a + 2] * q->ray[2][i]);
+                c += batch.normal[a][k] * (s->R[3 * a] * q->ray[0][i] + s->R[3 * a + 1] * q->ray[1][i] + s->R[3 * a + 2] * q->ray[2][i]);
             double variance = sigma * sigma * c * c + tolerance * tolerance;
             inliers += w * exp(-0.5 * r * r / variance);
         }
@@ -423,7 +456,7 @@ static inline void score_one(const Grid *g, const Surfel *surfels, const Query *
     s->weight = total;
 }
 
-WIDE void streetfix_align(const Grid *g, const Surfel *surfels, const Query *q, const Options *o, double tolerance, double height_min,
+WIDE void streetfix_align(const Grid *g, const PackedSurfel *surfels, const Query *q, const Options *o, double tolerance, double height_min,
                           int64_t count, State *states)
 {
     Recent recent;
@@ -435,7 +468,7 @@ WIDE void streetfix_align(const Grid *g, const Surfel *surfels, const Query *q, 
 }
 
 /* Adds weight x residual x gradient of all points of each patch to ``gradients`` (patches, 8), which the caller sets to 0. */
-void streetfix_gradients(const Grid *g, const Surfel *surfels, const Query *q, const Options *o, const State *s, const int32_t *patch,
+void streetfix_gradients(const Grid *g, const PackedSurfel *surfels, const Query *q, const Options *o, const State *s, const int32_t *patch,
                          double *gradients)
 {
     Batch batch;
@@ -451,7 +484,7 @@ void streetfix_gradients(const Grid *g, const Surfel *surfels, const Query *q, c
     }
 }
 
-/* Writes to ``found`` the index of the surfel that the grid holds for each position (count, 3), surfels' frame, m; -1 for none. */
+/* Writes to ``found`` the row of the surfel that the grid holds for each position (count, 3), surfels' frame, m; -1 for none. */
 WIDE void streetfix_lookup(const Grid *g, const double *positions, int64_t count, int32_t *found)
 {
     Recent recent;
@@ -459,19 +492,21 @@ WIDE void streetfix_lookup(const Grid *g, const double *positions, int64_t count
     for (int64_t first = 0; first < count; first += BATCH_SIZE) {
         const int64_t left = count - first, some = left < BATCH_SIZE ? left : BATCH_SIZE;
         double at[3][BATCH_SIZE] = {{0}};
-        const int32_t *cells[BATCH_SIZE];
+        float local[3][BATCH_SIZE];
+        int64_t rows[BATCH_SIZE];
         for (int64_t k = 0; k < some; k++)
             for (int a = 0; a < 3; a++) at[a][k] = positions[3 * (first + k) + a];
-        find_cells(g, at, some, &recent, cells);
-        for (int64_t k = 0; k < some; k++) found[first + k] = cells[k] ? *cells[k] : -1;
+        find_cells(g, at, some, &recent, local, rows);
+        for (int64_t k = 0; k < some; k++) found[first + k] = (int32_t)rows[k];
     }
 }
 
-/* Builds one region; its key is set. ``which`` (count): indices of the surfels whose reach may touch the region, ascending. Work memory for
+/* Builds one region; its key is set. ``xyz`` (n, 3): positions of all surfels, surfels' frame, m. ``which`` (count): rows of the surfels
+ * whose reach may touch the region, ascending. Work memory for
  * all cells of the region: ``surfel_of`` and ``distance2``. Writes the row of each block to the region, the filled blocks to ``blocks``, and
  * the surfels of their filled cells to ``nearest``. The field ``first`` of a block counts from the start of ``nearest``. Returns the number
  * of blocks. */
-int64_t streetfix_build_region(const Grid *g, const Surfel *surfels, const int32_t *which, int64_t count, double reach, int32_t *surfel_of,
+int64_t streetfix_build_region(const Grid *g, const float *xyz, const int32_t *which, int64_t count, double reach, int32_t *surfel_of,
                                float *distance2, Region *region, Block *blocks, int32_t *nearest)
 {
     const double o[3] = {g->ox, g->oy, g->oz};
@@ -480,7 +515,7 @@ int64_t streetfix_build_region(const Grid *g, const Surfel *surfels, const int32
                                REGION_EDGE * (region->key & mask)};
     for (int64_t i = 0; i < REGION_EDGE * REGION_EDGE * REGION_EDGE; i++) surfel_of[i] = -1, distance2[i] = INFINITY;
     for (int64_t i = 0; i < count; i++) {
-        const float *p = surfels[which[i]].xyz;
+        const float *p = xyz + 3 * (int64_t)which[i];
         int64_t low[3], high[3];
         for (int k = 0; k < 3; k++) {
             low[k] = (int64_t)ceil((p[k] - reach - o[k]) / g->cell - 0.5);
@@ -523,6 +558,71 @@ int64_t streetfix_build_region(const Grid *g, const Surfel *surfels, const int32
     return found;
 }
 
+/* Position of a surfel from the corner of the grid, in steps. */
+static inline int64_t steps_of(const Grid *g, const Surfel *surfel, int axis)
+{
+    const double origin[3] = {g->ox, g->oy, g->oz};
+    return llround((surfel->xyz[axis] - origin[axis]) / g->cell * STEPS);
+}
+
+/* Writes the key of the region that each surfel belongs to. */
+void streetfix_keys(const Grid *g, const Surfel *surfels, int64_t count, int64_t *keys)
+{
+    for (int64_t i = 0; i < count; i++)
+        keys[i] = key_of(steps_of(g, surfels + i, 0) / CUBE_STEPS, steps_of(g, surfels + i, 1) / CUBE_STEPS,
+                         steps_of(g, surfels + i, 2) / CUBE_STEPS);
+}
+
+static inline double clamped(double value, double most)
+{
+    return value < most ? value : most;
+}
+
+/* Packs the surfels ``rows`` (count). */
+void streetfix_pack(const Grid *g, const Surfel *surfels, const int64_t *rows, int64_t count, PackedSurfel *packed)
+{
+    for (int64_t i = 0; i < count; i++) {
+        const Surfel *m = surfels + rows[i];
+        for (int a = 0; a < 3; a++) packed[i].xyz[a] = (uint16_t)(steps_of(g, m, a) % CUBE_STEPS);
+        const double norm = fabs((double)m->normal[0]) + fabs((double)m->normal[1]) + fabs((double)m->normal[2]);
+        double x = norm > 0 ? m->normal[0] / norm : 0, y = norm > 0 ? m->normal[1] / norm : 0;
+        if (m->normal[2] < 0) {
+            const double folded = (1 - fabs(y)) * (x < 0 ? -1 : 1);
+            y = (1 - fabs(x)) * (y < 0 ? -1 : 1), x = folded;
+        }
+        packed[i].normal[0] = (int16_t)lround(x * NORMAL_STEPS), packed[i].normal[1] = (int16_t)lround(y * NORMAL_STEPS);
+        packed[i].thickness = (uint8_t)clamped(round(sqrt((double)m->thickness_m / THICKNESS_M)), UINT8_MAX);
+        packed[i].points = m->points ? (uint8_t)clamped(1 + round(log((double)m->points) / POINTS_LOG), UINT8_MAX) : 0;
+    }
+}
+
+/* Unpacks the surfels ``rows`` (count), in any order. ``cubes`` has all surfels of the map. */
+void streetfix_unpack(double cell, const Cube *cubes, int64_t cube_count, const PackedSurfel *packed, const int64_t *rows, int64_t count,
+                      Surfel *surfels)
+{
+    const Cube *cube = cubes;
+    uint32_t points[UINT8_MAX + 1] = {0};
+    for (int code = 1; code <= UINT8_MAX; code++) points[code] = (uint32_t)clamped(round(exp((code - 1) * POINTS_LOG)), UINT32_MAX);
+    for (int64_t i = 0; i < count; i++) {
+        const PackedSurfel *m = packed + rows[i];
+        if (rows[i] < cube->first || rows[i] >= cube->first + cube->count) {
+            int64_t low = 0, high = cube_count; /* the last cube that begins at or before the row is in low .. high - 1 */
+            while (high - low > 1) {
+                const int64_t middle = (low + high) / 2;
+                if (cubes[middle].first <= rows[i])
+                    low = middle;
+                else
+                    high = middle;
+            }
+            cube = cubes + low;
+        }
+        for (int a = 0; a < 3; a++) surfels[i].xyz[a] = (float)(cube->corner[a] + cell / STEPS * m->xyz[a]);
+        unpack_normal(m->normal, surfels[i].normal);
+        surfels[i].thickness_m = unpack_thickness(m->thickness);
+        surfels[i].points = points[m->points];
+    }
+}
+
 /* Fills the hash table: ``slots`` (2 to the power of ``slot_bits``) for ``count`` regions. The caller sets it to -1, and it has more slots
  * than regions. */
 void streetfix_fill_slots(const Region *regions, int64_t count, int64_t slot_bits, int32_t *slots)
@@ -535,31 +635,32 @@ void streetfix_fill_slots(const Region *regions, int64_t count, int64_t slot_bit
     }
 }
 
-/* Renders the depth (z, m) of the surfels, each a small square that faces the camera; 1e9 where nothing is mapped. ``tiles`` (n, 4):
- * centre x, y, first surfel, number of surfels. Tiles beyond ``tile_reach`` are skipped. R and t are T_map_camera. */
-void streetfix_render(const Surfel *surfels, const double *tiles, int64_t tile_count, double tile_reach, const double *R, const double *t,
+/* Renders the depth (z, m) of the surfels, each a small square that faces the camera; 1e9 where nothing is mapped. ``cell``: edge of a cell,
+ * m. Cubes out of reach or outside the field of view are skipped. R and t are T_map_camera. */
+void streetfix_render(const PackedSurfel *surfels, const Cube *cubes, int64_t cube_count, double cell, const double *R, const double *t,
                       double fx, double fy, double cx, double cy, int64_t width, int64_t height, double half_size, double reach,
                       float *depth)
 {
     for (int64_t i = 0; i < width * height; i++) depth[i] = 1e9f;
     const float r[9] = {(float)R[0], (float)R[1], (float)R[2], (float)R[3], (float)R[4],
                         (float)R[5], (float)R[6], (float)R[7], (float)R[8]};
-    const float tx = (float)t[0], ty = (float)t[1], tz = (float)t[2], far = (float)reach;
+    const float far = (float)reach, step = (float)(cell / STEPS);
     const float left = (float)(-(cx + 4) / fx), right = (float)((width - cx + 4) / fx);
     const float top = (float)(-(cy + 4) / fy), bottom = (float)((height - cy + 4) / fy);
-    for (int64_t n = 0; n < tile_count; n++) {
-        const double *tile = tiles + 4 * n;
-        double ex = tile[0] - t[0], ey = tile[1] - t[1];
-        if (hypot(ex, ey) > tile_reach) continue;
-        /* Skip tiles beside and behind the field of view. */
-        double ahead = R[2] * ex + R[5] * ey, beside = R[0] * ex + R[3] * ey;
-        double half = tile_reach - reach + HEIGHT * fabs(R[8]), wide = tile_reach - reach + HEIGHT * fabs(R[6]);
-        if (ahead < -half || beside - right * ahead > hypot(1, right) * fmax(half, wide) ||
-            left * ahead - beside > hypot(1, left) * fmax(half, wide))
+    const double half_edge = 0.5 * REGION_EDGE * cell, radius = sqrt(3.0) * half_edge;
+    for (int64_t n = 0; n < cube_count; n++) {
+        const Cube *cube = cubes + n;
+        double e[3];
+        for (int a = 0; a < 3; a++) e[a] = cube->corner[a] + half_edge - t[a];
+        if (e[0] * e[0] + e[1] * e[1] + e[2] * e[2] > (reach + radius) * (reach + radius)) continue;
+        /* Skip cubes beside and behind the field of view. */
+        const double ahead = R[2] * e[0] + R[5] * e[1] + R[8] * e[2], beside = R[0] * e[0] + R[3] * e[1] + R[6] * e[2];
+        if (ahead < -radius || beside - right * ahead > hypot(1, right) * radius || left * ahead - beside > hypot(1, left) * radius)
             continue;
-        const Surfel *m = surfels + (int64_t)tile[2], *end = m + (int64_t)tile[3];
+        const float tx = (float)(t[0] - cube->corner[0]), ty = (float)(t[1] - cube->corner[1]), tz = (float)(t[2] - cube->corner[2]);
+        const PackedSurfel *m = surfels + cube->first, *end = m + cube->count;
         for (; m < end; m++) {
-            float dx = m->xyz[0] - tx, dy = m->xyz[1] - ty, dz = m->xyz[2] - tz;
+            float dx = step * m->xyz[0] - tx, dy = step * m->xyz[1] - ty, dz = step * m->xyz[2] - tz;
             float z = r[2] * dx + r[5] * dy + r[8] * dz;
             if (z < 0.5f || z > far) continue;
             float x = r[0] * dx + r[3] * dy + r[6] * dz, y = r[1] * dx + r[4] * dy + r[7] * dz;
@@ -632,10 +733,11 @@ void streetfix_consistency(const float *rendered, int64_t height, int64_t width,
 const LayoutEntry streetfix_layout[] = {
     SURFEL_LAYOUT,
     LAYOUT_STRUCT(Block), LAYOUT_FIELD(Block, filled), LAYOUT_FIELD(Block, first), LAYOUT_FIELD(Block, before),
-    LAYOUT_STRUCT(Region), LAYOUT_FIELD(Region, key), LAYOUT_FIELD(Region, first), LAYOUT_FIELD(Region, row),
+    LAYOUT_STRUCT(Region), LAYOUT_FIELD(Region, key), LAYOUT_FIELD(Region, block), LAYOUT_FIELD(Region, surfel),
+    LAYOUT_FIELD(Region, other), LAYOUT_FIELD(Region, surfels), LAYOUT_FIELD(Region, others), LAYOUT_FIELD(Region, row),
     LAYOUT_STRUCT(Grid), LAYOUT_FIELD(Grid, ox), LAYOUT_FIELD(Grid, oy), LAYOUT_FIELD(Grid, oz),
     LAYOUT_FIELD(Grid, cell), LAYOUT_FIELD(Grid, slot_bits), LAYOUT_FIELD(Grid, slots), LAYOUT_FIELD(Grid, regions),
-    LAYOUT_FIELD(Grid, blocks), LAYOUT_FIELD(Grid, nearest),
+    LAYOUT_FIELD(Grid, blocks), LAYOUT_FIELD(Grid, nearest), LAYOUT_FIELD(Grid, nearest_bytes), LAYOUT_FIELD(Grid, others),
     LAYOUT_STRUCT(Query), LAYOUT_FIELD(Query, count), LAYOUT_FIELD(Query, xyz), LAYOUT_FIELD(Query, ray),
     LAYOUT_FIELD(Query, sigma), LAYOUT_FIELD(Query, weight), LAYOUT_FIELD(Query, q),
     LAYOUT_STRUCT(Options), LAYOUT_FIELD(Options, iterations), LAYOUT_FIELD(Options, reach),
@@ -650,7 +752,7 @@ const LayoutEntry streetfix_layout[] = {
     LAYOUT_STRUCT(Beam), LAYOUT_FIELD(Beam, hit), LAYOUT_FIELD(Beam, new), LAYOUT_FIELD(Beam, removed),
     LAYOUT_FIELD(Beam, outlier), LAYOUT_FIELD(Beam, roughness_m), LAYOUT_FIELD(Beam, span_m), LAYOUT_FIELD(Beam, threshold_sigmas),
     LAYOUT_FIELD(Beam, margin_m), LAYOUT_FIELD(Beam, unmapped_m), LAYOUT_FIELD(Beam, scale), LAYOUT_FIELD(Beam, offset),
-    LAYOUT_CONSTANT(UNKNOWNS), LAYOUT_CONSTANT(BLOCK), LAYOUT_CONSTANT(KEY_BITS), LAYOUT_CONSTANT(REGION), LAYOUT_CONSTANT(BATCH_SIZE),
+    LAYOUT_CONSTANT(UNKNOWNS), LAYOUT_CONSTANT(BLOCK), LAYOUT_CONSTANT(KEY_BITS), LAYOUT_CONSTANT(REGION), LAYOUT_CONSTANT(STEPS), LAYOUT_CONSTANT(BATCH_SIZE),
     LAYOUT_END,
 };
 /* clang-format on */

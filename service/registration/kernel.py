@@ -8,7 +8,7 @@ Speed: a solver step takes a sixth of the time of NumPy over all starts at once 
 import ctypes
 from collections.abc import Iterator
 from ctypes import POINTER, Structure, byref, c_double, c_int64, c_void_p
-from dataclasses import astuple, dataclass, fields
+from dataclasses import astuple, dataclass, field, fields
 from functools import cache
 from itertools import product
 from pathlib import Path
@@ -38,13 +38,24 @@ LIBRARY = Path(__file__).with_name("_kernel.so")
 
 #: A surfel: position (m, surfels' frame), unit normal, thickness across the surface (m), number of survey points.
 SURFEL = np.dtype([("xyz", "<f4", (3,)), ("normal", "<f4", (3,)), ("thickness_m", "<f4"), ("points", "<u4")])
+#: A surfel as a map holds it (``NearestGrid.unpacked``). xyz: position from the corner of its region, ``STEPS`` along the edge of a cell.
+#: normal: octahedral map of the unit vector (Meyer et al., Eurographics Symposium on Rendering 2010). thickness, points: codes.
+PACKED_SURFEL = np.dtype([("xyz", "<u2", (3,)), ("normal", "<i2", (2,)), ("thickness", "u1"), ("points", "u1")])
+#: Steps of a packed position along the edge of a cell.
+STEPS = 1024
+#: The surfels of a region: its corner (surfels' frame, m), row of the first, number.
+CUBE = np.dtype([("corner", "<f8", (3,)), ("first", "<i8"), ("count", "<i8")])
 #: A block of the lookup grid with at least one filled cell. A filled cell has a surfel in reach of its centre.
 #: filled: 64 bits for each part, bit (x * 4 + y) * 4 + z for a cell. first: entry of its first filled cell in ``NearestGrid.nearest``.
 #: before: number of filled cells in the parts before each part.
 GRID_BLOCK = np.dtype([("filled", "<u8", (8,)), ("first", "<i8"), ("before", "<u2", (8,))])
-#: A region with at least one block. key: its numbers along x, y and z, 18 bits each, x first. first: row of its first block in
-#: ``NearestGrid.blocks``. row: row of each block, counted from ``first``, plus 1; 0 for none.
-GRID_REGION = np.dtype([("key", "<i8"), ("first", "<i8"), ("row", "<u2", (REGION**3,))])
+#: A region with at least one block or surfel. key: its numbers along x, y and z, 18 bits each, x first. block, surfel, other: rows of its
+#: first block in ``NearestGrid.blocks``, of its first surfel, and of its first entry in ``NearestGrid.others``. surfels, others: numbers of
+#: its surfels and of its entries in ``others``. row: row of each block, counted from ``block``, plus 1; 0 for none.
+GRID_REGION = np.dtype(
+    [("key", "<i8"), ("block", "<i8"), ("surfel", "<i8"), ("other", "<i8"), ("surfels", "<u4"), ("others", "<u4"),
+     ("row", "<u2", (REGION**3,))]
+)  # fmt: skip
 #: State of one start: pose of the level frame, scale, offset, centre and up axis of the priors, information, score, and how the
 #: solver ended.
 STATE = np.dtype(
@@ -60,6 +71,8 @@ class _Grid(Structure):
         *((name, c_double) for name in ("ox", "oy", "oz", "cell")),
         ("slot_bits", c_int64),
         *((name, c_void_p) for name in ("slots", "regions", "blocks", "nearest")),
+        ("nearest_bytes", c_int64),
+        ("others", c_void_p),
     ]
 
 
@@ -152,6 +165,8 @@ def _library() -> ctypes.CDLL:
         LIBRARY,
         {
             "Surfel": SURFEL,
+            "PackedSurfel": PACKED_SURFEL,
+            "Cube": CUBE,
             "Block": GRID_BLOCK,
             "Region": GRID_REGION,
             "Grid": _Grid,
@@ -160,7 +175,14 @@ def _library() -> ctypes.CDLL:
             "State": STATE,
             "Beam": _Beam,
         },
-        {"UNKNOWNS": UNKNOWNS, "BLOCK": BLOCK, "KEY_BITS": KEY_BITS, "REGION": REGION, "BATCH_SIZE": BATCH_SIZE},
+        {
+            "UNKNOWNS": UNKNOWNS,
+            "BLOCK": BLOCK,
+            "KEY_BITS": KEY_BITS,
+            "REGION": REGION,
+            "STEPS": STEPS,
+            "BATCH_SIZE": BATCH_SIZE,
+        },
     )
     library.streetfix_align.argtypes = [
         POINTER(_Grid),
@@ -190,6 +212,9 @@ def _library() -> ctypes.CDLL:
     ]  # fmt: skip
     library.streetfix_build_region.restype = c_int64
     library.streetfix_fill_slots.argtypes = [c_void_p, c_int64, c_int64, c_void_p]
+    library.streetfix_keys.argtypes = [POINTER(_Grid), c_void_p, c_int64, c_void_p]
+    library.streetfix_pack.argtypes = [POINTER(_Grid), c_void_p, c_void_p, c_int64, c_void_p]
+    library.streetfix_unpack.argtypes = [c_double, c_void_p, c_int64, c_void_p, c_void_p, c_int64, c_void_p]
     library.streetfix_render.argtypes = [
         c_void_p, c_void_p, c_int64, c_double, c_void_p, c_void_p, c_double, c_double, c_double, c_double, c_int64, c_int64,
         c_double, c_double, c_void_p,
@@ -199,6 +224,9 @@ def _library() -> ctypes.CDLL:
         "streetfix_gradients",
         "streetfix_lookup",
         "streetfix_fill_slots",
+        "streetfix_keys",
+        "streetfix_pack",
+        "streetfix_unpack",
         "streetfix_render",
     ):
         getattr(library, name).restype = None
@@ -210,7 +238,7 @@ class NearestGrid:
     """Lookup grid of the surfel nearest to each cell's centre; may be memory-mapped.
 
     It has three levels: regions of 8 x 8 x 8 blocks of 8 x 8 x 8 cells. Regions, blocks and cells without a surfel in reach take no
-    memory. So the size follows the mapped surfaces, not the box around them.
+    memory. So the size follows the mapped surfaces, not the box around them. The surfels of a map are sorted by region.
 
     Attributes:
         origin_m: corner of the grid in the surfels' frame, m.
@@ -219,7 +247,10 @@ class NearestGrid:
             the number of regions.
         regions: (R,) of ``GRID_REGION``, ascending by key.
         blocks: (B,) of ``GRID_BLOCK``, region by region.
-        nearest: index of the surfel nearest to each filled cell, block by block, part by part, in the order of the bits.
+        nearest: number of the surfel nearest to each filled cell, block by block, part by part, in the order of the bits (F,), uint16 or
+            uint32. A region numbers its own surfels first, then those of its entries in ``others``.
+        others: rows of surfels of other regions (E,), region by region.
+        cubes: (R,) of ``CUBE``; computed.
     """
 
     origin_m: Float64[NDArray[np.float64], "3"]
@@ -227,10 +258,24 @@ class NearestGrid:
     slots: Int32[NDArray[np.int32], " H"]
     regions: NDArray[Any]
     blocks: NDArray[Any]
-    nearest: Int32[NDArray[np.int32], " F"]
+    nearest: NDArray[Any]
+    others: Int32[NDArray[np.int32], " E"]
+    cubes: NDArray[Any] = field(init=False)
+
+    def __post_init__(self) -> None:
+        cubes, key = np.empty(len(self.regions), CUBE), self.regions["key"]
+        numbers = np.stack([key >> 2 * KEY_BITS, key >> KEY_BITS, key], axis=1) & ((1 << KEY_BITS) - 1)
+        cubes["corner"] = self.origin_m + numbers * self.region_m
+        cubes["first"], cubes["count"] = self.regions["surfel"], self.regions["surfels"]
+        object.__setattr__(self, "cubes", cubes)
+
+    @property
+    def region_m(self) -> float:
+        """Edge of a region, m."""
+        return REGION * BLOCK * self.cell_m
 
     def surfels_at(self, positions_m: Float64[NDArray[np.float64], "n 3"]) -> Int32[NDArray[np.int32], " n"]:
-        """Return the surfel that the cell of each position refers to; -1 for none.
+        """Return the row of the surfel that the cell of each position refers to; -1 for none.
 
         Args:
             positions_m: positions in the surfels' frame, m.
@@ -240,10 +285,33 @@ class NearestGrid:
         _library().streetfix_lookup(byref(self._as_c()), positions_m.ctypes.data, len(positions_m), found.ctypes.data)
         return found
 
+    def unpacked(self, surfels: NDArray[Any], rows: NDArray[np.integer[Any]]) -> NDArray[Any]:
+        """Return surfels as numbers: (n,) of ``SURFEL``.
+
+        Args:
+            surfels: of the map, (S,) of ``PACKED_SURFEL``.
+            rows: rows in ``surfels`` (n,), fastest if ascending.
+        """
+        rows, found = np.ascontiguousarray(rows, np.int64), np.empty(len(rows), SURFEL)
+        _library().streetfix_unpack(
+            self.cell_m,
+            self.cubes.ctypes.data,
+            len(self.cubes),
+            surfels.ctypes.data,
+            rows.ctypes.data,
+            len(rows),
+            found.ctypes.data,
+        )
+        return found
+
     def _as_c(self) -> _Grid:
-        arrays = (self.slots, self.regions, self.blocks, self.nearest)
-        addresses = (each.ctypes.data for each in arrays)
-        return _Grid(*self.origin_m, self.cell_m, len(self.slots).bit_length() - 1, *addresses)
+        slots, regions, blocks, nearest, others = (
+            each.ctypes.data for each in (self.slots, self.regions, self.blocks, self.nearest, self.others)
+        )
+        slot_bits = len(self.slots).bit_length() - 1
+        return _Grid(
+            *self.origin_m, self.cell_m, slot_bits, slots, regions, blocks, nearest, self.nearest.itemsize, others
+        )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -308,7 +376,7 @@ def align(
 
     Args:
         grid: lookup grid of the map.
-        surfels: of the map, (S,) of ``SURFEL``.
+        surfels: of the map, (S,) of ``PACKED_SURFEL``.
         query: points of the query.
         states: the starts, (n,) of ``STATE``; overwritten with the results.
         options: of the solver; with 0 ``iterations`` the states are only scored.
@@ -340,7 +408,7 @@ def gradients(
 
     Args:
         grid: lookup grid of the map.
-        surfels: of the map, (S,) of ``SURFEL``.
+        surfels: of the map, (S,) of ``PACKED_SURFEL``.
         query: points of the query.
         state: the pose, (1,) of ``STATE``.
         options: of the solver. The robust kernel has the width of the last iteration.
@@ -377,15 +445,20 @@ def _as_c(query: QueryPoints, options: SolverOptions) -> tuple[_Query, _Options]
     return points, given
 
 
-def nearest_grid(surfels: NDArray[Any], *, cell_m: float, reach_m: float) -> NearestGrid:
-    """Build the lookup grid of a map, once per map build.
+def packed_map(
+    surfels: NDArray[Any], *, cell_m: float, reach_m: float
+) -> tuple[NearestGrid, NDArray[Any], NDArray[np.int64]]:
+    """Pack the surfels of a map and build their lookup grid, once per map build.
 
-    It is built region by region. The memory grows with the number of surfels, not with the distances between them.
+    The grid is built region by region. The memory grows with the number of surfels, not with the distances between them.
 
     Args:
-        surfels: of the map, (S,) of ``SURFEL``.
+        surfels: of the map, (S,) of ``SURFEL``, in any order.
         cell_m: edge of a cell, m.
         reach_m: largest distance from a surfel to the centre of a cell that refers to it, m.
+
+    Returns:
+        The grid, the surfels (S,) of ``PACKED_SURFEL`` sorted by region, and their rows in ``surfels`` (S,).
 
     Raises:
         StreetfixError: the surfels lie too far from each other for the numbers of the regions.
@@ -398,39 +471,93 @@ def nearest_grid(surfels: NDArray[Any], *, cell_m: float, reach_m: float) -> Nea
             f"the cloud extends over {extent_m / 1000:,.0f} km, but a lookup grid with cells of {cell_m:g} m reaches "
             f"{most_m / 1000:,.0f} km; build a map of each area"
         )
-    regions, blocks, nearest = [np.zeros(0, GRID_REGION)], [np.zeros(0, GRID_BLOCK)], [np.zeros(0, np.int32)]
-    first_block = first_cell = 0
-    for region, some, cells in _regions(surfels, origin, cell_m, reach_m):
-        region["first"], some["first"] = first_block, some["first"] + first_cell
+    frame, keys = _Grid(*origin, cell_m), np.empty(len(surfels), np.int64)
+    _library().streetfix_keys(byref(frame), surfels.ctypes.data, len(surfels), keys.ctypes.data)
+    order = np.argsort(keys, kind="stable")
+    packed = np.empty(len(surfels), PACKED_SURFEL)
+    _library().streetfix_pack(byref(frame), surfels.ctypes.data, order.ctypes.data, len(surfels), packed.ctypes.data)
+    key, first, count = np.unique(keys[order], return_index=True, return_counts=True)
+    own = np.zeros(len(key), GRID_REGION)
+    own["key"], own["surfel"], own["surfels"] = key, first, count
+    del keys
+    xyz = _positions(_without_cells(origin, cell_m, own), packed)
+    regions, blocks, nearest, others = [], [np.zeros(0, GRID_BLOCK)], [np.zeros(0, np.uint16)], [np.zeros(0, np.int32)]
+    first_block = first_cell = first_other = 0
+    for region, some, cells in _regions(xyz, own, origin, cell_m, reach_m):
+        numbers, foreign = _numbered(cells, region)
+        region["block"], region["other"], region["others"] = first_block, first_other, len(foreign)
+        some["first"] += first_cell
         first_block, first_cell = first_block + len(some), first_cell + len(cells)
+        first_other += len(foreign)
         regions.append(region)
         blocks.append(some)
-        nearest.append(cells)
+        nearest.append(numbers)
+        others.append(foreign)
     whole = np.concatenate(regions)
     slot_bits = max(1, (2 * len(whole) - 1).bit_length())
     slots = np.full(1 << slot_bits, -1, np.int32)
     _library().streetfix_fill_slots(whole.ctypes.data, len(whole), slot_bits, slots.ctypes.data)
-    return NearestGrid(origin, cell_m, slots, whole, np.concatenate(blocks), np.concatenate(nearest))
+    # Two bytes are enough unless a region has 65,536 surfels. Then all numbers of the map take four.
+    entries = np.concatenate(nearest)
+    grid = NearestGrid(origin, cell_m, slots, whole, np.concatenate(blocks), entries, np.concatenate(others))
+    return grid, packed, order
+
+
+def _numbered(
+    cells: Int32[NDArray[np.int32], " f"], region: NDArray[Any]
+) -> tuple[NDArray[Any], Int32[NDArray[np.int32], " e"]]:
+    """Return the rows of surfels as numbers of a region (f,), uint16 if they are small enough, and the rows of other regions (e,)."""
+    own = int(region["surfels"][0])
+    numbers = cells.astype(np.int64) - region["surfel"]
+    outside = (numbers < 0) | (numbers >= own)
+    foreign, place = np.unique(cells[outside], return_inverse=True)
+    numbers[outside] = own + place
+    return numbers.astype(np.uint16 if own + len(foreign) <= 1 << 16 else np.uint32), foreign
+
+
+def _without_cells(origin_m: Float64[NDArray[np.float64], "3"], cell_m: float, regions: NDArray[Any]) -> NearestGrid:
+    """Return a grid that has only its regions. It can unpack surfels."""
+    none = np.zeros(0, np.int32)
+    return NearestGrid(origin_m, cell_m, none, regions, np.zeros(0, GRID_BLOCK), np.zeros(0, np.uint16), none)
+
+
+def _positions(grid: NearestGrid, surfels: NDArray[Any]) -> Float32[NDArray[np.float32], "S 3"]:
+    """Return the positions of all surfels in the surfels' frame, m."""
+    xyz = np.empty((len(surfels), 3), np.float32)
+    for first in range(0, len(surfels), _CHUNK):
+        rows = np.arange(first, min(first + _CHUNK, len(surfels)))
+        xyz[rows] = grid.unpacked(surfels, rows)["xyz"]
+    return xyz
 
 
 def _regions(
-    surfels: NDArray[Any], origin_m: Float64[NDArray[np.float64], "3"], cell_m: float, reach_m: float
+    xyz: Float32[NDArray[np.float32], "S 3"],
+    own: NDArray[Any],
+    origin_m: Float64[NDArray[np.float64], "3"],
+    cell_m: float,
+    reach_m: float,
 ) -> Iterator[tuple[NDArray[Any], NDArray[Any], Int32[NDArray[np.int32], " f"]]]:
-    """Yield the regions with blocks, ascending by key: the region (1,), its blocks, and the surfels of their filled cells.
+    """Yield the regions, ascending by key: the region (1,), its blocks, and the rows of the surfels of their filled cells.
 
-    The field ``first`` of a block counts from the region's first filled cell.
+    ``own`` has the regions with surfels, with their surfels. The field ``first`` of a block counts from the region's first filled cell.
     """
     frame = _Grid(*origin_m, cell_m)
     edge = REGION * BLOCK
-    keys, starts, which = _touched(surfels, origin_m, edge * cell_m, reach_m)
+    touched, starts, which = _touched(xyz, origin_m, edge * cell_m, reach_m)
+    keys = np.union1d(touched, own["key"])
+    reached = np.searchsorted(touched, keys), np.searchsorted(touched, keys, side="right")
+    first_own = np.searchsorted(own["key"], keys)
     surfel_of, distance2 = np.empty(edge**3, np.int32), np.empty(edge**3, np.float32)
     blocks, nearest = np.empty(REGION**3, GRID_BLOCK), np.empty(edge**3, np.int32)
-    for key, first, end in zip(keys, starts[:-1], starts[1:], strict=True):
-        region, some = np.zeros(1, GRID_REGION), which[first:end]
+    for key, low, high, row in zip(keys, *reached, first_own, strict=True):
+        region, some = np.zeros(1, GRID_REGION), which[starts[low] : starts[high]]
         region["key"] = key
+        region["surfel"] = own["surfel"][row] if row < len(own) else len(xyz)
+        if row < len(own) and own["key"][row] == key:
+            region["surfels"] = own["surfels"][row]
         count = _library().streetfix_build_region(
             byref(frame),
-            surfels.ctypes.data,
+            xyz.ctypes.data,
             some.ctypes.data,
             len(some),
             reach_m,
@@ -440,13 +567,18 @@ def _regions(
             blocks.ctypes.data,
             nearest.ctypes.data,
         )
-        if count:  # the reach of a surfel may touch a region without reaching the centre of a cell
+        if (
+            count or region["surfels"][0]
+        ):  # the reach of a surfel may touch a region without reaching the centre of a cell
             cells = int(np.bitwise_count(blocks["filled"][:count]).sum())
             yield region, blocks[:count].copy(), nearest[:cells].copy()
 
 
 def _touched(
-    surfels: NDArray[Any], origin_m: Float64[NDArray[np.float64], "3"], region_m: float, reach_m: float
+    positions: Float32[NDArray[np.float32], "S 3"],
+    origin_m: Float64[NDArray[np.float64], "3"],
+    region_m: float,
+    reach_m: float,
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], Int32[NDArray[np.int32], " p"]]:
     """Return the surfels whose reach touches each region: keys of regions (R,), ascending; first entry of each (R + 1,); indices (p,).
 
@@ -454,7 +586,7 @@ def _touched(
     """
 
     def pairs_of(first: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        xyz = surfels["xyz"][first : first + _CHUNK].astype(np.float64) - origin_m
+        xyz = positions[first : first + _CHUNK].astype(np.float64) - origin_m
         low, high = (np.floor((xyz + sign * reach_m) / region_m).astype(np.int64) for sign in (-1, 1))
         keys, numbers = [], []
         for step in product(*(range(int(extent) + 1) for extent in (high - low).max(axis=0))):
@@ -468,11 +600,11 @@ def _touched(
     # A pair is one number of 64 bits: the row of the region, then the surfel. So the pairs are sorted in place. The first round finds the
     # regions and counts the pairs.
     regions, count = np.zeros(0, np.int64), 0
-    for first in range(0, len(surfels), _CHUNK):
+    for first in range(0, len(positions), _CHUNK):
         keys, _ = pairs_of(first)
         regions, count = np.union1d(regions, keys), count + len(keys)
     pairs, filled = np.empty(count, np.int64), 0
-    for first in range(0, len(surfels), _CHUNK):
+    for first in range(0, len(positions), _CHUNK):
         keys, numbers = pairs_of(first)
         pairs[filled : filled + len(keys)] = (np.searchsorted(regions, keys) << 32) + numbers
         filled += len(keys)
@@ -482,10 +614,9 @@ def _touched(
 
 
 def render(
+    grid: NearestGrid,
     surfels: NDArray[Any],
-    tiles: Float64[NDArray[np.float64], "n 4"],
     *,
-    tile_m: float,
     T_map_camera: Float64[NDArray[np.float64], "4 4"],
     camera: PinholeCamera,
     size_m: float,
@@ -494,9 +625,8 @@ def render(
     """Render the depth image that a camera would see of the surfels: z in metres, 0 where nothing is mapped.
 
     Args:
-        surfels: of the map, (S,) of ``SURFEL``, sorted by tile.
-        tiles: centre x, y (surfels' frame, m), first surfel, number of surfels.
-        tile_m: edge of a tile, m.
+        grid: lookup grid of the map.
+        surfels: of the map, (S,) of ``PACKED_SURFEL``.
         T_map_camera: pose of the camera in the surfels' frame.
         camera: intrinsics of the rendered image, a small one.
         size_m: edge of the square that represents a surfel, m.
@@ -506,9 +636,9 @@ def render(
     R, t = np.ascontiguousarray(T_map_camera[:3, :3]), np.ascontiguousarray(T_map_camera[:3, 3])
     _library().streetfix_render(
         surfels.ctypes.data,
-        tiles.ctypes.data,
-        len(tiles),
-        reach_m + 0.71 * tile_m,
+        grid.cubes.ctypes.data,
+        len(grid.cubes),
+        grid.cell_m,
         R.ctypes.data,
         t.ctypes.data,
         camera.fx,

@@ -99,23 +99,31 @@ static inline int chunk_size(int64_t remaining)
     return remaining < CHUNK ? (int)remaining : CHUNK;
 }
 
-/* Collects the surfels that may be visible from any camera within ``near_m`` and ``near_rad`` of a view, in the map's order. Copies go to
- * ``collected``, their indices to ``numbers``. Both have room for all surfels of ``parts`` (n, 2): first surfel, number of surfels. Returns
- * the number of collected surfels. */
-WIDE int64_t streetfix_collect(const Surfel *surfels, const int64_t *parts, int64_t part_count, const View *v, const Discs *o,
-                               double near_m, double near_rad, Surfel *collected, int32_t *numbers)
+/* Collects the surfels of some cubes that may be visible from any camera within ``near_m`` and ``near_rad`` of a view, in the map's order.
+ * They go to ``collected`` without their thickness and points, and their rows to ``numbers``. Both have room for all surfels of the cubes.
+ * ``cell``: edge of a cell, m. Returns the number of collected surfels. */
+WIDE int64_t streetfix_collect(const PackedSurfel *surfels, const Cube *cubes, int64_t cube_count, double cell, const View *v,
+                               const Discs *o, double near_m, double near_rad, Surfel *collected, int32_t *numbers)
 {
     const Frustum s = frustum_of(v);
+    const double step = cell / STEPS;
     int32_t indices[CHUNK];
+    Surfel chunk[CHUNK];
     int64_t count = 0;
-    for (int64_t p = 0; p < part_count; p++)
-        for (int64_t k = parts[2 * p], end = k + parts[2 * p + 1]; k < end; k += CHUNK) {
-            const int visible = select_visible(surfels + k, chunk_size(end - k), &s, o, (float)near_m, (float)near_rad, indices);
+    for (int64_t c = 0; c < cube_count; c++) {
+        const double *corner = cubes[c].corner;
+        for (int64_t k = cubes[c].first, end = k + cubes[c].count; k < end; k += CHUNK) {
+            const int size = chunk_size(end - k);
+            for (int i = 0; i < size; i++)
+                for (int a = 0; a < 3; a++) chunk[i].xyz[a] = (float)(corner[a] + step * surfels[k + i].xyz[a]);
+            const int visible = select_visible(chunk, size, &s, o, (float)near_m, (float)near_rad, indices);
             for (int i = 0; i < visible; i++, count++) {
-                collected[count] = surfels[k + indices[i]];
+                for (int a = 0; a < 3; a++) collected[count].xyz[a] = chunk[indices[i]].xyz[a];
+                unpack_normal(surfels[k + indices[i]].normal, collected[count].normal);
                 numbers[count] = (int32_t)(k + indices[i]);
             }
         }
+    }
     return count;
 }
 
@@ -312,7 +320,7 @@ static inline double product(const double *one, const double *other, int count)
 
 /* Adds the normal equations of one image to H (8, 8) and b (8). Writes the gradient of each patch to ``gradients`` (patches, 8): the sum of
  * weight x residual x derivative. The shared error of each patch is one unknown with a prior, marginalised by the Schur complement.
- * ``inverse`` (height, width): measured 1 / z, 0 for none. A patch has at most MOST_PIXELS pixels. Adds half the
+ * ``surfels`` (height, width): the surfel of each pixel where ``surfel_of`` is not -1. ``inverse``: measured 1 / z, 0 for none. A patch has at most MOST_PIXELS pixels. Adds half the
  * weighted squared residuals to ``error``. Returns the number of pixels used. */
 WIDE int64_t streetfix_normal_equations(const Surfel *surfels, const View *v, const int32_t *surfel_of, const float *inverse,
                                         const uint8_t *movable, const DepthModel *model, double *H, double *b, double *gradients,
@@ -329,7 +337,7 @@ WIDE int64_t streetfix_normal_equations(const Surfel *surfels, const View *v, co
                     const int64_t i = y * v->width + x;
                     if (surfel_of[i] < 0 || !(inverse[i] > 0)) continue;
                     const int before = count;
-                    add_pixel(surfels + surfel_of[i], v, model, (double)x, (double)y, (double)inverse[i], &batch, &count);
+                    add_pixel(surfels + i, v, model, (double)x, (double)y, (double)inverse[i], &batch, &count);
                     if (count > before && movable[i]) moved += pow((double)inverse[i], 4);
                 }
             if (count == 0) continue;

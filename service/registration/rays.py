@@ -283,8 +283,9 @@ def _normal_equations(
             settings.patch,
         )
         view = View.of(state.camera_of(picture), camera)
+        of_pixels = cloud.unpacked(np.maximum(surfels.ravel(), 0))
         pixels += _library().streetfix_normal_equations(
-            cloud.surfels.ctypes.data,
+            of_pixels.ctypes.data,
             byref(view),
             surfels.ctypes.data,
             picture.inverse.ctypes.data,

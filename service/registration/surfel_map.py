@@ -1,4 +1,4 @@
-"""The surfel map of a map bundle: surfels, the tiles they are sorted by, and a lookup grid of nearest surfels.
+"""The surfel map of a map bundle: surfels and a lookup grid of nearest surfels.
 
 ``build-map`` computes all of it, and the service reads it as it is on disk. A request builds nothing.
 """
@@ -8,83 +8,90 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float32, Float64
+from jaxtyping import Float16, Float32, Float64
 from numpy.typing import NDArray
 
 from service.errors import BundleError
 from service.registration.kernel import (
     GRID_BLOCK,
     GRID_REGION,
-    SURFEL,
+    PACKED_SURFEL,
     NearestGrid,
     QueryPoints,
     SolverOptions,
     align,
-    nearest_grid,
+    packed_map,
 )
 
 #: Edge of a cell of the lookup grid, and largest distance from a surfel to a cell that refers to it, m.
 CELL_M, REACH_M = 0.4, 1.2
-#: Edge of a tile, m.
-TILE_M = 40.0
 
-
-_FLOATS, _NUMBERS, _BRIGHT = np.dtype("<f8"), np.dtype("<i4"), np.dtype("<f4")
+_FLOATS, _NUMBERS, _BRIGHT = np.dtype("<f8"), np.dtype("<i4"), np.dtype("<f2")
 #: Name of the array of intensities. Maps of earlier releases, or of a sensor without intensity, do not have it.
 BRIGHTNESS = "brightness"
 #: Type and shape of every other array by name; -1 is any length.
 _EXPECTED: dict[str, tuple[np.dtype[Any], tuple[int, ...]]] = {
     "origin": (_FLOATS, (3,)),
-    "surfels": (SURFEL, (-1,)),
-    "tiles": (_FLOATS, (-1, 4)),
+    "surfels": (PACKED_SURFEL, (-1,)),
     "grid_frame": (_FLOATS, (4,)),
     "grid_slots": (_NUMBERS, (-1,)),
     "grid_regions": (GRID_REGION, (-1,)),
     "grid_blocks": (GRID_BLOCK, (-1,)),
-    "grid_nearest": (_NUMBERS, (-1,)),
+    "grid_nearest": (np.dtype("<u2"), (-1,)),
+    "grid_others": (_NUMBERS, (-1,)),
 }
+#: ``grid_nearest`` of a map with more than 65,536 surfels in a region.
+_WIDE = np.dtype("<u4")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SurfelMap:
-    """Surfels, their tiles for rendering, and their lookup grid for registration.
+    """Surfels, and their lookup grid for registration. Rendering goes through the regions of the grid.
 
     Positions are relative to ``origin_m``, with the axes of the map frame. We call this the surfels' frame.
 
     Attributes:
         origin_m: origin of the surfels' frame, map frame, m.
-        surfels: (S,) of ``SURFEL``, sorted by tile.
-        tiles: centre x, y (surfels' frame, m), first surfel, number of surfels.
+        surfels: (S,) of ``PACKED_SURFEL``, sorted by region of the grid.
         grid: lookup grid of the nearest surfel.
         brightness: mean intensity of each surfel's returns in the sensor's unit, NaN where unknown; None if the map has no intensities.
     """
 
     origin_m: Float64[NDArray[np.float64], "3"]
     surfels: NDArray[Any]
-    tiles: Float64[NDArray[np.float64], "n 4"]
     grid: NearestGrid
-    brightness: Float32[NDArray[np.float32], " s"] | None = None
+    brightness: Float16[NDArray[np.float16], " s"] | None = None
 
     @classmethod
     def prepare(
         cls,
         origin_m: Float64[NDArray[np.float64], "3"],
         surfels: NDArray[Any],
-        tiles: Float64[NDArray[np.float64], "n 4"],
         brightness: Float32[NDArray[np.float32], " s"] | None = None,
     ) -> "SurfelMap":
-        """Build the lookup grid of a map; this takes seconds for a district.
+        """Pack the surfels of a map and build the lookup grid; this takes seconds for a district.
 
         Args:
             origin_m: origin of the surfels' frame, map frame, m.
-            surfels: (S,) of ``SURFEL``, sorted by tile.
-            tiles: centre x, y (surfels' frame, m), first surfel, number of surfels.
+            surfels: (S,) of ``SURFEL``, in any order.
             brightness: mean intensity of each surfel's returns, NaN where unknown. An array without a value above 0 comes from a sensor
                 without intensity and counts as None.
         """
-        if brightness is not None and not (brightness > 0).any():
-            brightness = None
-        return cls(origin_m, surfels, tiles, nearest_grid(surfels, cell_m=CELL_M, reach_m=REACH_M), brightness)
+        grid, packed, order = packed_map(surfels, cell_m=CELL_M, reach_m=REACH_M)
+        if brightness is None or not (brightness > 0).any():
+            return cls(origin_m, packed, grid)
+        most = np.finfo(_BRIGHT).max
+        return cls(origin_m, packed, grid, np.minimum(brightness[order], most).astype(_BRIGHT))
+
+    def unpacked(self, rows: NDArray[np.integer[Any]] | slice) -> NDArray[Any]:
+        """Return surfels as numbers: (n,) of ``SURFEL``, in the surfels' frame.
+
+        Args:
+            rows: rows in ``surfels`` (n,), or a slice of them.
+        """
+        if isinstance(rows, slice):
+            rows = np.arange(*rows.indices(len(self.surfels)))
+        return self.grid.unpacked(self.surfels, rows)
 
     @property
     def has_brightness(self) -> bool:
@@ -131,19 +138,19 @@ class SurfelMap:
         """Return the arrays to write, by name; ``from_arrays`` reads them again.
 
         Returns:
-            origin (3,), surfels (S,), tiles (T, 4), grid_frame (4,), grid_slots (H,), grid_regions (R,), grid_blocks (B,),
-            grid_nearest (F,). A map with intensities also has brightness (S,). ``grid_frame`` holds the grid's origin and the
-            edge of its cells, m.
+            origin (3,), surfels (S,), grid_frame (4,), grid_slots (H,), grid_regions (R,), grid_blocks (B,), grid_nearest (F,),
+            grid_others (E,). A map with intensities also has brightness (S,). ``grid_frame`` holds the grid's origin and the edge
+            of its cells, m.
         """
         arrays = {
             "origin": self.origin_m,
             "surfels": self.surfels,
-            "tiles": self.tiles,
             "grid_frame": np.array([*self.grid.origin_m, self.grid.cell_m]),
             "grid_slots": self.grid.slots,
             "grid_regions": self.grid.regions,
             "grid_blocks": self.grid.blocks,
             "grid_nearest": self.grid.nearest,
+            "grid_others": self.grid.others,
         }
         return arrays if self.brightness is None else arrays | {BRIGHTNESS: self.brightness}
 
@@ -152,8 +159,8 @@ class SurfelMap:
         """Assemble a map from arrays that were read or memory-mapped.
 
         Args:
-            arrays: arrays by name, as ``arrays`` returns them: origin (3,), surfels (S,), tiles (T, 4), grid_frame (4,),
-                grid_slots (H,), grid_regions (R,), grid_blocks (B,), grid_nearest (F,) and, if the map has intensities, brightness (S,).
+            arrays: arrays by name, as ``arrays`` returns them: origin (3,), surfels (S,), grid_frame (4,), grid_slots (H,),
+                grid_regions (R,), grid_blocks (B,), grid_nearest (F,), grid_others (E,) and, if the map has intensities, brightness (S,).
             verify: check every index and number. The kernel itself does not check them.
 
         Raises:
@@ -164,7 +171,8 @@ class SurfelMap:
                 raise _defect(name, "missing")
             array = arrays[name]
             fits = len(shape) == array.ndim and all(w in (-1, has) for w, has in zip(shape, array.shape, strict=True))
-            if array.dtype != dtype or not fits or not array.flags["C_CONTIGUOUS"]:
+            wide = name == "grid_nearest" and array.dtype == _WIDE
+            if (array.dtype != dtype and not wide) or not fits or not array.flags["C_CONTIGUOUS"]:
                 raise _defect(
                     name, f"{array.dtype} of shape {array.shape} instead of {dtype} of shape {shape} (-1: any)"
                 )
@@ -174,10 +182,9 @@ class SurfelMap:
                 BRIGHTNESS, f"{brightness.dtype} of shape {brightness.shape} instead of one {_BRIGHT} per surfel"
             )
         frame = np.array(arrays["grid_frame"])
-        grid = NearestGrid(
-            frame[:3], float(frame[3]), *(arrays[f"grid_{name}"] for name in ("slots", "regions", "blocks", "nearest"))
-        )
-        found = cls(np.array(arrays["origin"]), arrays["surfels"], np.array(arrays["tiles"]), grid, brightness)
+        parts = ("slots", "regions", "blocks", "nearest", "others")
+        grid = NearestGrid(frame[:3], float(frame[3]), *(arrays[f"grid_{name}"] for name in parts))
+        found = cls(np.array(arrays["origin"]), arrays["surfels"], grid, brightness)
         if verify:
             found.require_consistent()
         return found
@@ -191,19 +198,11 @@ class SurfelMap:
         if not np.isfinite(self.grid.origin_m).all() or not self.grid.cell_m > 0:
             raise _defect("grid_frame", "the origin is not finite, or the cell size is not positive")
         _require_levels(self.grid)
-        _require_indices("grid_nearest", self.grid.nearest, len(self.surfels), least=0)
-        first, count = self.tiles[:, 2], self.tiles[:, 3]
-        if not np.isfinite(self.tiles).all() or (first < 0).any() or (count < 0).any():
-            raise _defect("tiles", "a number is not finite, or an index is negative")
-        if len(self.tiles) and (first + count).max() > len(self.surfels):
-            raise _defect("tiles", "a tile ends beyond the surfels")
+        _require_surfels(self.grid, len(self.surfels))
         if not np.isfinite(self.origin_m).all():
             raise _defect("origin", "a coordinate is not finite")
         if self.brightness is not None and (np.isinf(self.brightness).any() or (self.brightness < 0).any()):
             raise _defect(BRIGHTNESS, "a brightness is negative or infinite")
-        for name in ("xyz", "normal", "thickness_m"):
-            if not np.isfinite(self.surfels[name]).all():
-                raise _defect("surfels", f"a number of {name} is not finite")
 
 
 def _require_levels(grid: NearestGrid) -> None:
@@ -217,13 +216,36 @@ def _require_levels(grid: NearestGrid) -> None:
     if not np.array_equal(np.sort(slots[slots >= 0]), np.arange(len(regions))):
         raise _defect("grid_slots", "a region is missing or occurs twice")
     most = regions["row"].max(axis=1, initial=0).astype(np.int64)
-    if (regions["first"] < 0).any() or (regions["first"] > len(blocks) - most).any():
-        raise _defect("grid_regions", f"a block is outside the {len(blocks)} entries of grid_blocks")
+    _require_shares("grid_regions", "blocks", regions["block"], most, len(blocks))
     cells = np.cumsum(np.bitwise_count(blocks["filled"]), axis=1, dtype=np.int64)
-    if (blocks["before"][:, 0] != 0).any() or (blocks["before"][:, 1:] != cells[:, :-1]).any():
+    if (
+        (blocks["before"][:, 0] != 0).any()
+        or (blocks["before"][:, 1:] != cells[:, :-1]).any()
+        or (cells[:, -1] == 0).any()
+    ):
         raise _defect("grid_blocks", "a number of filled cells is wrong")
-    if (blocks["first"] < 0).any() or (blocks["first"] > len(grid.nearest) - cells[:, -1]).any():
-        raise _defect("grid_blocks", f"a cell is outside the {len(grid.nearest)} entries of grid_nearest")
+    _require_shares("grid_blocks", "cells", blocks["first"], cells[:, -1], len(grid.nearest))
+
+
+def _require_surfels(grid: NearestGrid, count: int) -> None:
+    """Check that the regions share out all surfels, and that every cell refers to one that its region numbers."""
+    regions = grid.regions
+    _require_shares("grid_regions", "surfels", regions["surfel"], regions["surfels"], count)
+    _require_shares("grid_regions", "entries of grid_others", regions["other"], regions["others"], len(grid.others))
+    _require_indices("grid_others", grid.others, count, least=0)
+    if not len(grid.blocks):
+        return
+    numbered = regions["surfels"].astype(np.int64) + regions["others"]
+    largest = np.maximum.reduceat(grid.nearest, grid.blocks["first"])
+    if (largest >= np.repeat(numbered, regions["row"].max(axis=1))).any():
+        raise _defect("grid_nearest", "a number is outside the surfels of its region")
+
+
+def _require_shares(name: str, what: str, first: NDArray[Any], count: NDArray[Any], whole: int) -> None:
+    """Check that ranges of rows follow each other without gaps, from 0 to the last one."""
+    ends = np.cumsum(count, dtype=np.int64)
+    if (first != ends - count).any() or (int(ends[-1]) if len(ends) else 0) != whole:
+        raise _defect(name, f"the {whole} {what} are not shared out one after the other")
 
 
 def _require_indices(name: str, indices: NDArray[np.int32], count: int, *, least: int) -> None:

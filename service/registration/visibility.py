@@ -19,8 +19,8 @@ from numpy.typing import NDArray
 from service.compiled import load
 from service.geometry.camera import PinholeCamera
 from service.geometry.rigid import Transform
-from service.registration.kernel import SURFEL
-from service.registration.surfel_map import TILE_M, SurfelMap
+from service.registration.kernel import CUBE, PACKED_SURFEL, SURFEL
+from service.registration.surfel_map import SurfelMap
 from service.registration.surfel_tiles import Cloud
 
 LIBRARY = Path(__file__).with_name("_rays.so")
@@ -98,11 +98,15 @@ class _Discs(Structure):
 
 @cache
 def _library() -> ctypes.CDLL:
-    library = load(LIBRARY, {"Surfel": SURFEL, "View": View, "Discs": _Discs, "Disc": _DISC})
+    library = load(
+        LIBRARY,
+        {"Surfel": SURFEL, "PackedSurfel": PACKED_SURFEL, "Cube": CUBE, "View": View, "Discs": _Discs, "Disc": _DISC},
+    )
     library.streetfix_collect.argtypes = [
         c_void_p,
         c_void_p,
         c_int64,
+        c_double,
         POINTER(View),
         POINTER(_Discs),
         c_double,
@@ -200,13 +204,14 @@ class SurfelRaycaster:
         return surfel_of
 
     def _collect(self, T_map_camera: Transform, camera: PinholeCamera) -> _Collection:
-        parts = self._tiles_in_view(T_map_camera, camera)
-        room = int(parts[:, 1].sum())
+        cubes = self._cubes_in_view(T_map_camera, camera)
+        room = int(cubes["count"].sum())
         surfels, numbers = np.empty(room, SURFEL), np.empty(room, np.int32)
         count = _library().streetfix_collect(
             self.cloud.surfels.ctypes.data,
-            parts.ctypes.data,
-            len(parts),
+            cubes.ctypes.data,
+            len(cubes),
+            self.cloud.grid.cell_m,
             byref(View.of(T_map_camera, camera)),
             byref(self._discs),
             NEAR_M + ROUNDING,
@@ -218,8 +223,8 @@ class SurfelRaycaster:
             each.resize(count, refcheck=False)  # frees the unused memory
         return _Collection(T_map_camera, camera, surfels, numbers)
 
-    def _tiles_in_view(self, T_map_camera: Transform, camera: PinholeCamera) -> NDArray[np.int64]:
-        """First surfel and number of surfels of the tiles that a camera may see from near a pose: (tiles, 2).
+    def _cubes_in_view(self, T_map_camera: Transform, camera: PinholeCamera) -> NDArray[Any]:
+        """Cubes of the regions that a camera may see from near a pose: (n,) of ``CUBE``.
 
         Seen from above, the field of view lies in the convex hull of five points. They are the camera and the four corners of the image
         at the largest depth.
@@ -228,9 +233,10 @@ class SurfelRaycaster:
         x, y = np.meshgrid((u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy)
         corners = self._settings.reach_m * np.stack([x.ravel(), y.ravel(), np.ones(4)], axis=1) @ T_map_camera[:3, :3].T
         hull = np.vstack([np.zeros(2), corners[:, :2]])
-        centres = self.cloud.tiles[:, :2] - T_map_camera[:2, 3]
+        cubes, edge_m = self.cloud.grid.cubes, self.cloud.grid.region_m
+        centres = cubes["corner"][:, :2] + edge_m / 2 - T_map_camera[:2, 3]
         motion_m = NEAR_M + NEAR_RAD * float(np.linalg.norm(corners, axis=1).max())
-        half = TILE_M / np.sqrt(2) + self._settings.radius_m + motion_m
+        half = edge_m / np.sqrt(2) + self._settings.radius_m + motion_m
         visible = np.ones(len(centres), bool)
         for one, other in combinations(range(len(hull)), 2):
             along = hull[other] - hull[one]
@@ -242,7 +248,7 @@ class SurfelRaycaster:
             for sign in (1.0, -1.0):
                 if (sign * sides <= 1e-6).all():  # an edge of the hull: all points lie on its inner side
                     visible &= sign * ((centres - hull[one]) @ outward) <= half
-        return np.ascontiguousarray(self.cloud.tiles[visible, 2:4].astype(np.int64))
+        return cubes[visible & (cubes["count"] > 0)]
 
 
 class Raycasters:

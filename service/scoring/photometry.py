@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float32, Int32, UInt8
+from jaxtyping import Bool, Float16, Float32, Int32, UInt8
 from numpy.typing import NDArray
 
 from service.geometry.camera import PinholeCamera
@@ -82,7 +82,7 @@ def seen_by_lens(
 
 
 def agreement_of_brightness(
-    brightness: Float32[NDArray[np.float32], " n"],
+    brightness: Float16[NDArray[np.float16], " n"],
     surfel_of: Int32[NDArray[np.int32], "H W"],
     grey: Float32[NDArray[np.float32], "H W"],
     settings: PhotometrySettings,
@@ -101,7 +101,7 @@ def agreement_of_brightness(
 
 
 def _rendered(
-    brightness: Float32[NDArray[np.float32], " n"],
+    brightness: Float16[NDArray[np.float16], " n"],
     surfel_of: Int32[NDArray[np.int32], "H W"],
     settings: PhotometrySettings,
 ) -> Float32[NDArray[np.float32], "H W"]:

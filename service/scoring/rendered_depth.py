@@ -14,7 +14,7 @@ from service.geometry.camera import PinholeCamera
 from service.geometry.rigid import Rotation, transform_from
 from service.registration.kernel import BeamModel, QueryPoints, consistency, render
 from service.registration.register import Registered
-from service.registration.surfel_map import TILE_M, SurfelMap
+from service.registration.surfel_map import SurfelMap
 from service.registration.surfel_tiles import Cloud
 from service.scoring.measured import MeasuredFrame
 from service.scoring.scorer import Scores
@@ -117,9 +117,8 @@ def agreement(cloud: SurfelMap, projected: ProjectedPoints, candidate: Registere
     """
     T = transform_from(candidate.R_map_level @ projected.R_level_camera, candidate.camera_m - cloud.origin_m)
     rendered = render(
+        cloud.grid,
         cloud.surfels,
-        cloud.tiles,
-        tile_m=TILE_M,
         T_map_camera=T,
         camera=projected.camera,
         size_m=SURFEL_M,

@@ -17,7 +17,6 @@ from service.geometry.rigid import Rotation, transform_from
 from service.registration.kernel import render
 from service.registration.points import DepthBlocks
 from service.registration.register import Registered
-from service.registration.surfel_map import TILE_M
 from service.registration.surfel_tiles import Cloud
 from service.scoring.measured import MeasuredFrame
 from service.scoring.rendered_depth import REACH_M, SURFEL_M
@@ -121,9 +120,8 @@ def rendered(
     """
     surfels = cloud.at(camera_m)
     return render(
+        surfels.grid,
         surfels.surfels,
-        surfels.tiles,
-        tile_m=TILE_M,
         T_map_camera=transform_from(R_map_camera, camera_m - surfels.origin_m),
         camera=CAMERA,
         size_m=SURFEL_M,

@@ -306,7 +306,7 @@ def streets_alike(
             streets=None,
             place_street=np.full(12, -1, np.int32),
             georeference=BERLIN,
-            cloud=SurfelMap.prepare(voxels.origin, *voxels.surfels_by_tile()),
+            cloud=SurfelMap.prepare(voxels.origin, *voxels.surfels()),
         )
         content.T_map_place[6:, 1, 3] = 90.0
         content.descriptors[:24] = content.descriptors[24:]

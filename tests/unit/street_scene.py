@@ -46,7 +46,7 @@ class Scene:
             shares = rng.uniform(0, 1, (int(per_m2 * np.linalg.norm(a) * np.linalg.norm(b)), 2))
             points = corner + shares[:, :1] * a + shares[:, 1:] * b
             voxels.add(points + rng.normal(0, noise_m, points.shape))
-        return SurfelMap.prepare(voxels.origin, *voxels.surfels_by_tile())
+        return SurfelMap.prepare(voxels.origin, *voxels.surfels())
 
     def ranges(self, origin_m: Floats, directions: Floats) -> Floats:
         """Return the distance along each direction to the first rectangle; infinite without an intersection."""
@@ -146,7 +146,7 @@ def street() -> Scene:
 def street_map(street: Scene) -> SurfelMap:
     """Return surfels exactly on the rectangles of the street, in one tile."""
     surfels = street.surfels()
-    return SurfelMap.prepare(np.zeros(3), surfels, np.array([[9.0, 0.0, 0.0, len(surfels)]]))
+    return SurfelMap.prepare(np.zeros(3), surfels)
 
 
 @pytest.fixture(scope="session")

@@ -29,22 +29,18 @@ def read(content: bytes) -> tuple[np.ndarray, np.ndarray]:
     return np.array(numbers[:3]) + records["xyz"] * np.array(numbers[3:]), records["upright"] / 65535
 
 
-def a_field(side: int, tiles: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return flat ground with a point every 0.2 m, in tiles along x."""
-    surfels = np.zeros(tiles * side * side, SURFEL)
-    x, y = np.meshgrid(np.arange(side), np.arange(side))
-    for tile in range(tiles):
-        part = surfels[tile * side * side : (tile + 1) * side * side]
-        part["xyz"][:, 0] = 0.2 * (x.ravel() + tile * side)
-        part["xyz"][:, 1] = 0.2 * y.ravel()
-    bounds = np.array([[0.0, 0.0, tile * side * side, side * side] for tile in range(tiles)])
-    return surfels, bounds
+def a_field(columns: int, rows: int) -> SurfelMap:
+    """Return flat ground with a point every 0.2 m."""
+    surfels = np.zeros(columns * rows, SURFEL)
+    x, y = np.meshgrid(np.arange(columns), np.arange(rows))
+    surfels["xyz"][:, 0], surfels["xyz"][:, 1] = 0.2 * x.ravel(), 0.2 * y.ravel()
+    return SurfelMap.prepare(np.zeros(3), surfels)
 
 
 def test_every_point_comes_within_a_step_of_where_it_is(bundle: MapBundle) -> None:
     assert bundle.cloud is not None
     points, upright = read(cloud_bytes(bundle.cloud, 1_000_000))
-    true = bundle.cloud.surfels["xyz"] + bundle.cloud.origin_m
+    true = bundle.cloud.unpacked(np.s_[:])["xyz"] + bundle.cloud.origin_m
     order, found = (np.lexsort(np.round(each, 1).T) for each in (true, points))
     assert np.abs(true[order].mean(axis=0) - points[found].mean(axis=0)).max() < 1e-3
     assert np.allclose(np.sort(true, axis=0), np.sort(points, axis=0), atol=2e-3)
@@ -59,24 +55,22 @@ def test_a_map_without_a_cloud_has_an_empty_one() -> None:
 
 @pytest.mark.parametrize("most", [100, 1000, 3000])
 def test_thinning_keeps_within_the_limit_and_leaves_no_gap(most: int) -> None:
-    surfels, tiles = a_field(40, 3)
-    rows = thinned(surfels, tiles, most)
+    field = a_field(120, 40)
+    rows = thinned(field, most)
     assert len(np.unique(rows)) == len(rows) <= most
     assert len(rows) > 0.3 * most
-    kept = surfels["xyz"][rows]
+    kept = field.unpacked(rows)["xyz"]
     spacing = np.sqrt(24.0 * 8.0 / most)
     gaps = [np.hypot(*(kept[:, :2] - xy).T).min() for xy in ([1.0, 1.0], [12.0, 4.0], [23.0, 7.0])]
     assert max(gaps) < 3 * spacing
 
 
 def test_a_cloud_that_is_small_enough_is_not_thinned() -> None:
-    surfels, tiles = a_field(10, 1)
-    assert len(thinned(surfels, tiles, 100)) == 100
+    assert len(thinned(a_field(10, 10), 100)) == 100
 
 
 def test_any_beginning_is_a_thinner_cloud_of_the_whole_map() -> None:
-    surfels, tiles = a_field(40, 3)
-    points, _ = read(cloud_bytes(SurfelMap.prepare(np.zeros(3), surfels, tiles), 10_000))
+    points, _ = read(cloud_bytes(a_field(120, 40), 10_000))
     begun = points[:200]
     assert begun[:, 0].min() < 3
     assert begun[:, 0].max() > 21

@@ -71,7 +71,7 @@ def test_points_lie_where_the_map_has_surfaces(explanation: Explanation, engine:
     assert isinstance(cloud, SurfelMap)
     records = np.frombuffer(explanation.points, np.dtype([("xyz", "<f4", (3,)), ("rgb", "u1", (4,))]))
     points = records["xyz"][::37] + explanation.origin_m
-    surfels = cloud.surfels["xyz"] + cloud.origin_m
+    surfels = cloud.unpacked(np.s_[:])["xyz"] + cloud.origin_m
     away = np.array([np.linalg.norm(surfels - point, axis=1).min() for point in points])
     assert np.median(away) < 0.3
 

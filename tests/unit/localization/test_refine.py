@@ -220,7 +220,7 @@ def judged(cloud, monkeypatch):
         return Scores(np.array(y_m))
 
     monkeypatch.setattr(BrightnessScorer, "score", brightness)
-    return replace(cloud, brightness=np.ones(len(cloud.surfels), np.float32)), asked_y_m
+    return replace(cloud, brightness=np.ones(len(cloud.surfels), np.float16)), asked_y_m
 
 
 def test_brightness_decides_among_candidates_that_are_close(bundle_like, judged, depth, both, seen_in):
@@ -255,7 +255,7 @@ def test_a_candidate_with_a_large_support_gap_is_not_rendered_and_stays_behind(
 def test_brightness_decides_between_two_streets_with_equal_depth(bundle_like, cloud, depth, both, seen_in):
     """The brightness of the map at the true pose, as an image of another scale and sign."""
     rng = np.random.default_rng(2)
-    lit = replace(cloud, brightness=rng.uniform(0.05, 1.0, len(cloud.surfels)).astype(np.float32))
+    lit = replace(cloud, brightness=rng.uniform(0.05, 1.0, len(cloud.surfels)).astype(np.float16))
     frame = seen_in(depth, both)
     camera = CAMERA.scaled_to(160, 120)
     T = TRUE.copy()
@@ -279,7 +279,7 @@ def test_a_noisy_query_triggers_a_local_search_and_moves_to_the_best_brightness(
     bundle_like, cloud, depth, here, seen_in, monkeypatch
 ):
     """Points do not constrain the position along a bare street. The brightness score is largest 1.4 m ahead of the result."""
-    lit = replace(cloud, brightness=np.ones(len(cloud.surfels), np.float32))
+    lit = replace(cloud, brightness=np.ones(len(cloud.surfels), np.float16))
     ahead = TRUE[:3, 3] + 1.4 * np.array([np.cos(np.deg2rad(HEADING_DEG)), np.sin(np.deg2rad(HEADING_DEG)), 0])
     monkeypatch.setattr(
         BrightnessScorer,

@@ -138,12 +138,12 @@ def test_the_cloud_of_a_tile_is_that_of_an_untiled_map_around_its_square(small_d
         low, high = low + 1.0, low + TILE_M + 2 * TILE_MARGIN_M - 1.0
         found, expected = (each[((each[:, :2] > low) & (each[:, :2] < high)).all(axis=1)] for each in (found, whole))
         assert len(found) == len(expected) > 1000
-        np.testing.assert_allclose(found, expected, atol=1e-4)
+        np.testing.assert_allclose(found, expected, atol=5e-4)  # half a step in each map
 
 
 def positions_of(cloud):
     """Return the positions of the surfels in the map frame, sorted by voxel."""
-    found = cloud.surfels["xyz"].astype(np.float64) + cloud.origin_m
+    found = cloud.unpacked(np.s_[:])["xyz"].astype(np.float64) + cloud.origin_m
     return found[np.lexsort(np.floor(found / SETTINGS.voxel_m).T)]
 
 

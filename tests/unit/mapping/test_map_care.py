@@ -154,7 +154,7 @@ def map_with(tmp_path, name, content, slabs, **changed):
     cloud = VoxelMap(0.3, np.zeros(3))
     for corner in slabs:
         cloud.add(slab(corner))
-    prepared = SurfelMap.prepare(cloud.origin, *cloud.surfels_by_tile())
+    prepared = SurfelMap.prepare(cloud.origin, *cloud.surfels())
     parameters = {**content.parameters, "voxel_m": 0.3, **changed.pop("parameters", {})}
     write_bundle(tmp_path / name, replace(content, cloud=prepared, parameters=parameters, **changed))
     return MapBundle.open(tmp_path / name)

@@ -7,6 +7,7 @@ import pytest
 from model_training.mapping import voxel_map
 from model_training.mapping.preview import preview_webp
 from service.registration.kernel import SURFEL
+from service.registration.surfel_map import SurfelMap
 
 
 def surfels_of(xyz, normal):
@@ -31,21 +32,20 @@ def street():
 def test_walls_are_dark_and_ground_is_light(street):
     """The picture has 2 px per metre, and a rim of 5 m: y = 15 m is 5 m + 5 m below its upper edge of 25 m."""
     surfels, track = street
-    found = decoded(preview_webp(surfels, np.array([100.0, 50.0, 0.0]), track + [100.0, 50.0, 0.0], longest_px=100))
+    cloud = SurfelMap.prepare(np.array([100.0, 50.0, 0.0]), surfels)
+    found = decoded(preview_webp(cloud, track + [100.0, 50.0, 0.0], longest_px=100))
     assert found.shape == (60, 101)
     wall, ground, rim = found[38:42, 30:70].min(), np.median(found[12:28, 30:70]), found[2, 2]
     assert wall < 150 < ground < rim
 
 
 def test_parts_give_the_same_picture(street, monkeypatch):
-    surfels, track = street
-    once = preview_webp(surfels, np.zeros(3), track)
+    cloud, track = SurfelMap.prepare(np.zeros(3), street[0]), street[1]
+    once = preview_webp(cloud, track)
     monkeypatch.setattr(voxel_map, "_PART", 100)
-    assert preview_webp(surfels, np.zeros(3), track) == once
+    assert preview_webp(cloud, track) == once
 
 
-def test_a_map_without_surfels_shows_the_track():
-    found = decoded(
-        preview_webp(surfels_of(np.zeros((0, 3)), (0, 0, 1)), np.zeros(3), np.array([[0.0, 0, 0], [20.0, 0, 0]]))
-    )
+def test_a_map_without_a_cloud_shows_the_track():
+    found = decoded(preview_webp(None, np.array([[0.0, 0, 0], [20.0, 0, 0]])))
     assert found.min() < 200

@@ -69,7 +69,7 @@ def test_the_offset_is_where_errors_and_prior_balance(odds_of, bits):
 
 def test_a_map_to_check_has_neither_calibration_nor_brightness_nor_preview(content):
     """The check images are rendered from the intensities of the same sensor. They agree with the map better than real images."""
-    cloud = SurfelMap.prepare(np.zeros(3), np.zeros(4, SURFEL), np.zeros((0, 4)), np.ones(4, np.float32))
+    cloud = SurfelMap.prepare(np.zeros(3), np.zeros(4, SURFEL), np.ones(4, np.float32))
     given = replace(content, cloud=cloud, preview_webp=b"x", calibration={"calibrated": True})
     found = site_check._to_check(given)
     assert found.calibration["calibrated"] is False

@@ -21,7 +21,7 @@ from service.retrieval.query import Query
 
 
 def positions(bundle):
-    return bundle.cloud.surfels["xyz"] + bundle.cloud.origin_m
+    return bundle.cloud.unpacked(np.s_[:])["xyz"] + bundle.cloud.origin_m
 
 
 @pytest.fixture(scope="module")
@@ -44,7 +44,7 @@ def test_a_map_extended_by_the_second_half_is_the_map_of_the_whole(extended, who
     tree: Any = cKDTree(positions(whole))
     distance, _ = tree.query(positions(extended))
     assert len(positions(extended)) == len(positions(whole))
-    assert distance.max() < 1e-4
+    assert distance.max() < 1e-3  # half a step in each map
 
 
 def test_it_answers_like_the_map_built_at_once(extended, whole, small_dataset):

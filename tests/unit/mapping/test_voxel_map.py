@@ -1,18 +1,15 @@
 import tracemalloc
 from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from scipy.spatial import cKDTree
 
 from model_training.mapping.cloud import prepared
 from model_training.mapping.passes import Targets
 from model_training.mapping.voxel_map import VOXEL, VoxelMap, lattice_origin
 from service.errors import DatasetError
-from service.registration.surfel_map import TILE_M
 
 
 def map_of(*clouds, voxel_m=0.5, origin=(100.0, -50.0, 2.0)):
@@ -23,7 +20,7 @@ def map_of(*clouds, voxel_m=0.5, origin=(100.0, -50.0, 2.0)):
 
 
 def surfels_of(voxels, *, fewest=5):
-    """Return the surfels of a map in the order of its voxels. Brightness is that of ``surfels_by_tile``."""
+    """Return the surfels of a map in the order of its voxels. Brightness is that of ``surfels``."""
     found = voxels.surfaces(fewest=fewest)
     rows, (keys, moments) = found.rows, voxels.sums()
     with np.errstate(invalid="ignore"):
@@ -114,35 +111,19 @@ def test_lonely_points_make_no_surfel():
     assert len(surfels_of(map_of([[101.0, -49.0, 3.0]] * 4)).positions) == 0
 
 
-def test_tiles_hold_every_surfel_once_and_within_their_edges():
-    rng = np.random.default_rng(3)
-    voxels = map_of(rng.uniform([0, -100, 0], [200, 60, 1], (60000, 3)), voxel_m=2.0)
-    surfels = surfels_of(voxels)
-    own, rows, _ = voxels.surfels_by_tile()
-    assert rows[:, 3].sum() == len(own) == len(surfels.positions)
-    np.testing.assert_array_equal(rows[:, 2], np.r_[0, np.cumsum(rows[:, 3])[:-1]])
-    tree: Any = cKDTree(own["xyz"] + voxels.origin)
-    distance, nearest = tree.query(surfels.positions)
-    assert distance.max() < 1e-4
-    assert len(set(nearest.tolist())) == len(own)
-    inside = own["xyz"][:, :2] - np.repeat(rows[:, :2], rows[:, 3].astype(int), axis=0)
-    assert np.abs(inside).max() <= TILE_M / 2 + 1e-3
-
-
-def test_surfels_by_tile_are_the_same_surfels(monkeypatch):
-    """Parts of 1,000 voxels; 2 x 2 tiles."""
+def test_surfels_computed_in_parts_are_the_same(monkeypatch):
+    """Parts of 1,000 voxels."""
     monkeypatch.setattr("model_training.mapping.voxel_map._PART", 1000)
     rng = np.random.default_rng(8)
     points = rng.uniform([0, 0, 0], [70, 70, 1], (60000, 3))
     voxels = lit(points, points[:, 2], origin=(0.0, 0.0, 0.0))
-    plain, (sorted_by_tile, tiles, brightness) = surfels_of(voxels), voxels.surfels_by_tile()
-    order = np.lexsort(np.floor(plain.positions[:, 1::-1] / TILE_M).T)
-    assert len(tiles) == 4
-    np.testing.assert_array_equal(sorted_by_tile["xyz"], plain.positions[order].astype(np.float32))
-    np.testing.assert_array_equal(sorted_by_tile["normal"], plain.normals[order])
-    np.testing.assert_array_equal(sorted_by_tile["thickness_m"], plain.thickness_m[order])
-    np.testing.assert_array_equal(sorted_by_tile["points"], plain.points[order])
-    np.testing.assert_array_equal(brightness, plain.brightness[order])
+    plain, (surfels, brightness) = surfels_of(voxels), voxels.surfels()
+    assert len(surfels) > 5000
+    np.testing.assert_array_equal(surfels["xyz"], plain.positions.astype(np.float32))
+    np.testing.assert_array_equal(surfels["normal"], plain.normals)
+    np.testing.assert_array_equal(surfels["thickness_m"], plain.thickness_m)
+    np.testing.assert_array_equal(surfels["points"], plain.points)
+    np.testing.assert_array_equal(brightness, plain.brightness)
 
 
 def test_coordinates_far_from_zero_lose_nothing():
@@ -207,7 +188,7 @@ def test_brightness_goes_along_with_its_surfel():
     rng = np.random.default_rng(6)
     points = rng.uniform([0, -100, 0], [200, 60, 1], (60000, 3))
     voxels = lit(points, points[:, 0], voxel_m=2.0)
-    surfels, _, brightness = voxels.surfels_by_tile()
+    surfels, brightness = voxels.surfels()
     assert np.abs(brightness - (surfels["xyz"][:, 0] + voxels.origin[0])).max() < 1e-3
 
 
@@ -362,7 +343,7 @@ def test_a_map_grows_without_a_copy_of_itself(monkeypatch):
     ("work", "most"),
     [
         (lambda voxels: voxels.surfaces(), 30),
-        (lambda voxels: voxels.surfels_by_tile(), 80),
+        (lambda voxels: voxels.surfels(), 80),
         (lambda voxels: sum(column.sum(dtype=np.float64) for column in voxels.columns().each()), 10),
         (lambda voxels: voxels.statistics(), 72),
         (lambda voxels: Targets.of(voxels), 50),

@@ -266,7 +266,7 @@ def test_the_same_map_has_the_same_version(indexed: Path, large: BundleContent) 
 
 
 def test_a_map_without_its_index_still_opens(indexed: Path) -> None:
-    """A bundle of format 4 that was built before there was an index."""
+    """A bundle that was built before there was an index."""
     document = json.loads((indexed / "manifest.json").read_text())
     del document["files"][FILE]
     (indexed / "manifest.json").write_bytes(Manifest.model_validate_json(json.dumps(document)).stamped().to_bytes())

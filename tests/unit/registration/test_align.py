@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from service.geometry.rigid import rotation_x, rotation_y, rotation_z
-from service.registration.kernel import STATE, QueryPoints, SolverOptions, align, nearest_grid
+from service.registration.kernel import STATE, QueryPoints, SolverOptions, align, packed_map
 
 #: A fixture of two values: grid and surfels, or rotation and position.
 Pair = tuple[Any, Any]
@@ -125,7 +125,7 @@ def test_the_score_falls_the_further_the_points_are_moved(street_map, seen, pose
 def plain(scene_of):
     """Return surfels and grid of a ground of 12 x 12 m about the origin, as ``align`` takes them."""
     surfels = scene_of(((-6, -6, 0), (12, 0, 0), (0, 12, 0))).surfels()
-    return nearest_grid(surfels, cell_m=0.4, reach_m=1.2), surfels
+    return packed_map(surfels, cell_m=0.4, reach_m=1.2)[:2]
 
 
 STILL = SolverOptions(iterations=0, reach=1.2, robust_first=1.0, robust_last=1.0)

@@ -196,7 +196,7 @@ def test_in_a_corridor_the_position_along_it_is_the_least_known(scene_of, start_
     ]
     corridor = scene_of(*(tuple(R @ np.array(each, float) for each in rectangle) for rectangle in flat))
     surfels = corridor.surfels(0.5)
-    cloud = SurfelMap.prepare(np.zeros(3), surfels, np.array([[0.0, 0, 0, len(surfels)]]))
+    cloud = SurfelMap.prepare(np.zeros(3), surfels)
     camera = np.array([0, 0, 1.5])
     points = corridor.points(R, camera)
     state = settle(cloud, points.subset(np.flatnonzero(np.linalg.norm(points.xyz, axis=1) < 25)), start_at(R, camera))

@@ -69,7 +69,7 @@ def test_straight_up_and_down_are_directions_too():
 def city(street):
     """Return the street as a map with another origin."""
     surfels = street.surfels()
-    return SurfelMap.prepare(ORIGIN, surfels, np.array([[9.0, 0.0, 0.0, len(surfels)]]))
+    return SurfelMap.prepare(ORIGIN, surfels)
 
 
 @pytest.fixture(scope="module")
@@ -134,7 +134,7 @@ def wall(scene_of):
     """Return a wall perpendicular to x through the map origin, without thickness."""
     surfels = scene_of(((0, -6, -6), (0, 12, 0), (0, 0, 12))).surfels()
     surfels["thickness_m"] = 0
-    return SurfelMap.prepare(ORIGIN, surfels, np.array([[0.0, 0.0, 0.0, len(surfels)]]))
+    return SurfelMap.prepare(ORIGIN, surfels)
 
 
 @pytest.mark.parametrize(
@@ -151,7 +151,7 @@ def test_few_patches_that_eight_unknowns_were_fitted_to_count_for_more(wall, poi
 
 def test_points_on_their_surfaces_do_not_disagree(scene_of, points_at):
     ground = scene_of(((-6, -6, 0), (12, 0, 0), (0, 12, 0))).surfels()
-    cloud = SurfelMap.prepare(ORIGIN, ground, np.array([[0.0, 0.0, 0.0, len(ground)]]))
+    cloud = SurfelMap.prepare(ORIGIN, ground)
     xy = np.random.default_rng(1).uniform(-5, 5, (100, 2))
     points = points_at(np.c_[xy, np.full(100, -1.5)])
     on, above = (Registered(np.eye(3), ORIGIN + [0, 0, z], 1.0, 0.0, 0.9, np.eye(8), 0) for z in (1.5, 1.6))

@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from service.geometry.rigid import rotation_z
-from service.registration.kernel import SURFEL, SolverOptions, align, gradients, nearest_grid
+from service.registration.kernel import SURFEL, SolverOptions, align, gradients, packed_map
 
 #: A fixture of two values: grid and surfels, or rotation and position.
 Pair = tuple[Any, Any]
@@ -22,14 +22,14 @@ def wall():
     """Return grid and surfel of a map with one surfel at the origin that faces x."""
     surfels = np.zeros(1, SURFEL)
     surfels["normal"] = [1, 0, 0]
-    return nearest_grid(surfels, cell_m=0.3, reach_m=1.2), surfels
+    return packed_map(surfels, cell_m=0.3, reach_m=1.2)[:2]
 
 
 @pytest.fixture(scope="module")
 def ground(scene_of):
     """Return a ground of 12 x 12 m about the origin."""
     surfels = scene_of(((-6, -6, 0), (12, 0, 0), (0, 12, 0))).surfels()
-    return nearest_grid(surfels, cell_m=0.4, reach_m=1.2), surfels
+    return packed_map(surfels, cell_m=0.4, reach_m=1.2)[:2]
 
 
 def numbers(*patch):

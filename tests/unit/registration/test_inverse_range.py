@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from service.geometry.rigid import rotation_z
-from service.registration.kernel import SURFEL, SolverOptions, align, nearest_grid
+from service.registration.kernel import SURFEL, SolverOptions, align, packed_map
 
 #: A fixture of two values: grid and surfels, or rotation and position.
 Pair = tuple[Any, Any]
@@ -23,7 +23,7 @@ def one_surfel():
     """Return a map with one surfel at the origin that faces x."""
     surfels = np.zeros(1, SURFEL)
     surfels["normal"] = [1, 0, 0]
-    return nearest_grid(surfels, cell_m=0.3, reach_m=1.2), surfels
+    return packed_map(surfels, cell_m=0.3, reach_m=1.2)[:2]
 
 
 def known(one_surfel: Pair, points, start, **options):
@@ -82,7 +82,7 @@ def wall(scene_of):
     """Return a wall perpendicular to x, 8 x 8 m about the origin, without thickness."""
     surfels = scene_of(((0, -4, -4), (0, 8, 0), (0, 0, 8))).surfels()
     surfels["thickness_m"] = 0
-    return nearest_grid(surfels, cell_m=0.4, reach_m=1.2), surfels
+    return packed_map(surfels, cell_m=0.4, reach_m=1.2)[:2]
 
 
 def seen_twice(points_at, distance_m, error):
@@ -111,9 +111,9 @@ def test_noise_that_is_even_in_inverse_range_draws_no_wall_nearer(
     The scale is fixed, because noise that is symmetric in 1 / range is not symmetric for a scale. Position and rotation are free.
     """
     R = rotation_z(heading)
-    surfels = wall[1].copy()
+    surfels = wall[0].unpacked(wall[1], np.arange(len(wall[1])))
     surfels["xyz"], surfels["normal"] = surfels["xyz"] @ R.T.astype("f4"), surfels["normal"] @ R.T.astype("f4")
-    turned = nearest_grid(surfels, cell_m=0.4, reach_m=1.2), surfels
+    turned = packed_map(surfels, cell_m=0.4, reach_m=1.2)[:2]
     start = start_at(R, R @ [off_m - distance_m, 0, 0])
     options = SolverOptions(**(FREE | {"prior_weight": 1e-6}), iterations=10, free_scale=False)
     align(*turned, seen_twice(points_at, distance_m, error), start, options)

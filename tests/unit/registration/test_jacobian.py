@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from service.registration.kernel import SURFEL, QueryPoints, SolverOptions, align, gradients, nearest_grid
+from service.registration.kernel import SURFEL, QueryPoints, SolverOptions, align, gradients, packed_map
 
 UNKNOWNS = ["x", "y", "z", "roll", "pitch", "yaw", "log scale", "disparity offset"]
 FREE: dict[str, Any] = {"reach": 1.0, "robust_first": 1e6, "robust_last": 1e6, "prior_weight": 0.0, "free_offset": True}
@@ -18,12 +18,13 @@ class Problem:
     def __init__(self, seed, *, off_m=0.0):
         rng = np.random.default_rng(seed)
         cells = np.stack(np.meshgrid(*[np.arange(4.0)] * 3), axis=-1).reshape(-1, 3)
-        self.surfels = np.zeros(len(cells), SURFEL)
-        self.surfels["xyz"] = 4 * cells + rng.uniform(-0.5, 0.5, cells.shape)
+        surfels = np.zeros(len(cells), SURFEL)
+        surfels["xyz"] = 4 * cells + rng.uniform(-0.5, 0.5, cells.shape)
         normals = rng.normal(size=cells.shape)
-        self.surfels["normal"] = normals / np.linalg.norm(normals, axis=1, keepdims=True)
-        self.surfels["thickness_m"] = rng.uniform(0, 0.05, len(cells))
-        self.grid = nearest_grid(self.surfels, cell_m=0.3, reach_m=1.2)
+        surfels["normal"] = normals / np.linalg.norm(normals, axis=1, keepdims=True)
+        surfels["thickness_m"] = rng.uniform(0, 0.05, len(cells))
+        self.grid, self.packed, _ = packed_map(surfels, cell_m=0.3, reach_m=1.2)
+        self.surfels = self.grid.unpacked(self.packed, np.arange(len(surfels)))
         self.R = Rotation.random(random_state=seed).as_matrix()
         self.t = rng.uniform(-3, 15, 3)
         self.log_scale, self.offset = rng.uniform(-0.05, 0.05), rng.uniform(-0.1, 0.1)
@@ -69,7 +70,7 @@ class Problem:
 
     def aligned(self, start_at, *, change=None, **options):
         state = self.state(start_at, change=change)
-        align(self.grid, self.surfels, self.points, state, SolverOptions(**(FREE | options)))
+        align(self.grid, self.packed, self.points, state, SolverOptions(**(FREE | options)))
         return state[0]
 
     def away(self, state):
@@ -113,7 +114,7 @@ def test_the_gradient_of_a_patch_equals_the_numerical_one(start_at, seed):
     expected = np.stack([each[patch == number].sum(axis=0) for number in range(8)])
     state, options = problem.state(start_at), SolverOptions(**FREE, iterations=1, surface=0.05)
     before = state.tobytes()
-    found = gradients(problem.grid, problem.surfels, problem.points, state, options, patch)
+    found = gradients(problem.grid, problem.packed, problem.points, state, options, patch)
     size = np.abs(each).sum(axis=0)
     np.testing.assert_allclose(found / size, expected / size, atol=1e-5)
     assert (found[6] == 0).all()
@@ -128,7 +129,7 @@ def test_the_sum_of_the_gradients_gives_the_solver_step(start_at, seed):
     state, options = problem.state(start_at), SolverOptions(**FREE, iterations=1, surface=0.05)
     count = len(problem.surfels)
     found = gradients(
-        problem.grid, problem.surfels, problem.points, state, options, np.arange(count, dtype=np.int32) % 9
+        problem.grid, problem.packed, problem.points, state, options, np.arange(count, dtype=np.int32) % 9
     )
     moved = problem.aligned(start_at, iterations=1, surface=0.05)
     damping = np.diag([0, 0, 0, *[1e-3 * problem.points.weight.sum()] * 3, 0, 0])
@@ -163,8 +164,8 @@ def test_a_point_off_its_surface_informs_the_less_the_narrower_the_robust_width(
     """Error 0.1 m and variance 0.1^2: the squared width is 4 x 0.01 plus the square of the robust width."""
     surfels = np.zeros(1, SURFEL)
     surfels["normal"] = [1, 0, 0]
-    grid = nearest_grid(surfels, cell_m=0.3, reach_m=1.2)
+    grid, packed, _ = packed_map(surfels, cell_m=0.3, reach_m=1.2)
     state = start_at(np.eye(3), [-5, 0, 0])
     options = SolverOptions(**(FREE | {"robust_first": robust_m, "robust_last": robust_m}), iterations=1, surface=0.1)
-    align(grid, surfels, points_at([[5.1, 0, 0]], sigma=0.0), state, options)
+    align(grid, packed, points_at([[5.1, 0, 0]], sigma=0.0), state, options)
     assert state["information"][0, 0, 0] == pytest.approx(expected, rel=1e-4)

@@ -10,7 +10,7 @@ from scipy.spatial import cKDTree
 from benchmarks.native.plain import surfels_of_cells
 from service.errors import StreetfixError
 from service.registration import kernel
-from service.registration.kernel import BLOCK, REGION, SURFEL, nearest_grid
+from service.registration.kernel import BLOCK, REGION, SURFEL, packed_map
 
 #: Shares of a random map: surfels in one heap, in two heaps a region apart, and in two towns 60 km apart.
 APART_M = [0.0, 30.0, 60_000.0]
@@ -20,6 +20,12 @@ def surfels_at(xyz):
     surfels = np.zeros(len(xyz), SURFEL)
     surfels["xyz"], surfels["normal"] = xyz, [0, 0, 1]
     return surfels
+
+
+def mapped(surfels, *, cell_m, reach_m):
+    """Return the grid of a map and the positions of its surfels, in the order of the map."""
+    grid, packed, _ = packed_map(surfels, cell_m=cell_m, reach_m=reach_m)
+    return grid, grid.unpacked(packed, np.arange(len(packed)))
 
 
 def cells_around(grid, surfels, reach_m):
@@ -62,7 +68,7 @@ def test_every_cell_holds_the_surfel_that_a_dense_grid_holds(seed, count, cell_m
     surfels = random_surfels(seed, count, extent_m, apart_m)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(kernel, "_CHUNK", 7)  # several chunks, as in a large map
-        grid = nearest_grid(surfels, cell_m=cell_m, reach_m=reach_m)
+        grid, surfels = mapped(surfels, cell_m=cell_m, reach_m=reach_m)
     cells = cells_around(grid, surfels, reach_m)
     expected = dense_grid(surfels, cells, grid, reach_m)
     centres = grid.origin_m + (cells + 0.5) * cell_m
@@ -77,7 +83,7 @@ def test_every_cell_within_reach_holds_its_nearest_surfel_and_every_other_none(
     seed, count, cell_m, reach_m, extent_m, apart_m
 ):
     surfels = random_surfels(seed, count, extent_m, apart_m)
-    grid = nearest_grid(surfels, cell_m=cell_m, reach_m=reach_m)
+    grid, surfels = mapped(surfels, cell_m=cell_m, reach_m=reach_m)
     cells = cells_around(grid, surfels, reach_m)
     centres = grid.origin_m + (cells + 0.5) * cell_m
     found = grid.surfels_at(centres)
@@ -93,7 +99,7 @@ def test_every_cell_within_reach_holds_its_nearest_surfel_and_every_other_none(
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf, 1e30, -1e30, 1e9, -0.5, 6.8e6])
 def test_a_position_outside_the_grid_has_no_surfel(value):
     surfels = surfels_at(np.random.default_rng(1).uniform(0, 3, (40, 3)))
-    grid = nearest_grid(surfels, cell_m=0.4, reach_m=1.2)
+    grid, surfels = mapped(surfels, cell_m=0.4, reach_m=1.2)
     inside = np.tile(surfels["xyz"][:1].astype(np.float64), (3, 1))
     assert (grid.surfels_at(inside) >= 0).all()
     np.fill_diagonal(inside, grid.origin_m + value)
@@ -104,14 +110,14 @@ def test_positions_of_many_regions_alternate():
     """The kernel remembers the last regions; two regions that are 8 regions apart share an entry."""
     step = 8 * REGION * BLOCK * 0.5
     surfels = surfels_at([[k * step, 0, 0] for k in range(5)])
-    grid = nearest_grid(surfels, cell_m=0.5, reach_m=1.0)
+    grid, _ = mapped(surfels, cell_m=0.5, reach_m=1.0)
     order = np.random.default_rng(0).integers(-1, 6, 1000)
     expected = np.where((order >= 0) & (order < 5), order, -1)
     np.testing.assert_array_equal(grid.surfels_at(np.c_[order * step, np.zeros((1000, 2))]), expected)
 
 
 def bytes_of(grid):
-    return sum(each.nbytes for each in (grid.slots, grid.regions, grid.blocks, grid.nearest))
+    return sum(each.nbytes for each in (grid.slots, grid.regions, grid.blocks, grid.nearest, grid.others))
 
 
 def test_two_towns_60_km_apart_take_what_both_take():
@@ -121,12 +127,12 @@ def test_two_towns_60_km_apart_take_what_both_take():
 
     def cost(xyz):
         surfels = surfels_at(xyz)
-        nearest_grid(surfels[:10], cell_m=0.4, reach_m=1.2)  # what the first call loads does not count
+        packed_map(surfels[:10], cell_m=0.4, reach_m=1.2)  # what the first call loads does not count
         tracemalloc.start()
-        grid = nearest_grid(surfels, cell_m=0.4, reach_m=1.2)
+        grid, packed, _ = packed_map(surfels, cell_m=0.4, reach_m=1.2)
         peak = tracemalloc.get_traced_memory()[1]
         tracemalloc.stop()
-        return bytes_of(grid), peak
+        return bytes_of(grid) + packed.nbytes, peak
 
     one, other, both = (cost(xyz) for xyz in (*parts, np.concatenate(parts)))
     for alone, together in zip(np.add(one, other), both, strict=True):
@@ -135,7 +141,7 @@ def test_two_towns_60_km_apart_take_what_both_take():
 
 def test_blocks_far_from_every_surfel_take_no_space():
     surfels = surfels_at([[0.0, 0, 0], [100, 0, 0]])
-    grid = nearest_grid(surfels, cell_m=0.5, reach_m=1.0)
+    grid, _ = mapped(surfels, cell_m=0.5, reach_m=1.0)
     assert 2 <= len(grid.regions) <= 16
     assert len(grid.blocks) == (grid.regions["row"] > 0).sum() <= 16
     assert len(grid.nearest) == np.bitwise_count(grid.blocks["filled"]).sum() <= 2 * 5**3
@@ -144,11 +150,11 @@ def test_blocks_far_from_every_surfel_take_no_space():
 def test_surfels_beyond_the_numbers_of_the_regions_are_refused():
     surfels = surfels_at([[0.0, 0, 0], [0, 7e6, 0]])
     with pytest.raises(StreetfixError, match=r"extends over 7,000 km, .* of 0\.4 m reaches 6,711 km; build a map of"):
-        nearest_grid(surfels, cell_m=0.4, reach_m=1.2)
+        packed_map(surfels, cell_m=0.4, reach_m=1.2)
 
 
 def test_a_missing_library_says_what_to_do(monkeypatch, tmp_path):
     kernel._library.cache_clear()
     monkeypatch.setattr(kernel, "LIBRARY", tmp_path / "_kernel.so")
     with pytest.raises(StreetfixError, match=r"_kernel\.so is missing .* install the package again"):
-        nearest_grid(surfels_at([[0.0, 0, 0]]), cell_m=0.5, reach_m=1.0)
+        packed_map(surfels_at([[0.0, 0, 0]]), cell_m=0.5, reach_m=1.0)

@@ -30,7 +30,7 @@ def adjust(cloud, pictures, found, of):
 def city(street):
     """Return the street as a map with another origin."""
     surfels = street.surfels()
-    return SurfelMap.prepare(ORIGIN, surfels, np.array([[9.0, 0.0, 0.0, len(surfels)]]))
+    return SurfelMap.prepare(ORIGIN, surfels)
 
 
 def picture_of(
@@ -154,7 +154,7 @@ def test_moved_cars_have_less_effect_where_points_are_marked_movable():
     y, z = (side.ravel() for side in np.meshgrid(*[np.arange(-20, 20, 0.2)] * 2))
     wall = np.zeros(len(y), SURFEL)
     wall["xyz"], wall["normal"] = np.stack([np.full(len(y), 10.0), y, z], axis=1), (1, 0, 0)
-    mapped = SurfelMap.prepare(ORIGIN, wall, np.array([[0.0, 0.0, 0.0, len(wall)]]))
+    mapped = SurfelMap.prepare(ORIGIN, wall)
     pose = np.eye(3), np.zeros(3)
     picture = RayPicture(inverse, CAMERA, transform_from(R_BODY_OPTICAL, np.zeros(3)), NOISE, None, movable)
     known = replace(SETTINGS, robust=50.0, rounds=4, scale=1e-4, turn_rad=1e-4)
@@ -178,7 +178,7 @@ def plain(city, picture, hits, R, t, *, scale, offset, s):
     """Compute residual, gradient by finite differences, weight and patch of every valid pixel."""
     v, u = np.nonzero((hits >= 0) & (picture.inverse > 0))
     ray = CAMERA.rays_of_pixels()[v, u]
-    surfels = city.surfels[hits[v, u]]
+    surfels = city.unpacked(hits[v, u])
     n, x = surfels["normal"].astype(float), surfels["xyz"].astype(float)
 
     def predicted(change):

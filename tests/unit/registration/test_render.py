@@ -1,9 +1,12 @@
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
 
 from service.geometry.camera import PinholeCamera
 from service.geometry.rigid import R_BODY_OPTICAL, rotation_z, transform_from
-from service.registration.kernel import SURFEL, render
+from service.registration.kernel import SURFEL, NearestGrid, packed_map, render
 
 CAMERA = PinholeCamera(32, 24, 20.0, 20.0, 15.5, 11.5)
 AHEAD = transform_from(R_BODY_OPTICAL, np.zeros(3))
@@ -18,14 +21,13 @@ def wall(x, *, y=(-20, 20), z=(-20, 20), step=0.1):
     return surfels
 
 
-def drawn(*walls, T=AHEAD, reach_m=40.0, centre=(0.0, 0.0)):
-    surfels = np.concatenate(walls)
-    tiles = np.array([[*centre, 0, len(surfels)]], np.float64)
-    return render(surfels, tiles, tile_m=10.0, T_map_camera=T, camera=CAMERA, size_m=0.12, reach_m=reach_m)
+def drawn(*walls, T=AHEAD, reach_m=40.0):
+    grid, surfels, _ = packed_map(np.concatenate(walls), cell_m=0.4, reach_m=1.2)
+    return render(grid, surfels, T_map_camera=T, camera=CAMERA, size_m=0.12, reach_m=reach_m)
 
 
 def test_a_wall_that_fills_the_view_stands_at_its_distance_in_every_pixel():
-    np.testing.assert_allclose(drawn(wall(10)), np.full((24, 32), 10.0), rtol=1e-6)
+    np.testing.assert_allclose(drawn(wall(10)), np.full((24, 32), 10.0), rtol=3e-5)
 
 
 def test_a_part_of_a_wall_is_drawn_in_its_pixels_alone():
@@ -70,25 +72,24 @@ def test_surfels_grow_in_the_picture_as_they_come_near():
     assert (drawn(wall(4, y=(-0.05, 0.05), z=(-0.05, 0.05))) > 0).sum() == 0
 
 
-def test_tiles_beyond_reach_are_left_out():
-    """40 m plus 0.71 of a tile's 10 m: tiles with a centre nearer than 47.1 m are rendered."""
-    assert (drawn(wall(10), centre=(47.0, 0.0)) > 0).all()
-    assert not drawn(wall(10), centre=(47.2, 0.0)).any()
-    assert not drawn(wall(10), centre=(0.0, -47.2)).any()
+@given(st.integers(0, 10**6), st.floats(-180, 180), st.floats(-80, 80), st.floats(-30, 30))
+@settings(max_examples=40, deadline=None)
+def test_a_region_outside_the_field_of_view_has_nothing_to_draw(seed, heading, pitch, roll):
+    """A map in one frame is drawn as one whose regions lie elsewhere: a far surfel moves the corner of the grid."""
+    rng = np.random.default_rng(seed)
+    walls = [wall(x, y=(y, y + 4), z=(z, z + 4)) for x, y, z in rng.uniform(-45, 45, (20, 3))]
+    R = Rotation.from_euler("zyx", [heading, pitch, roll], degrees=True).as_matrix() @ R_BODY_OPTICAL
+    T = transform_from(R, rng.uniform(-5, 5, 3))
+    far = wall(-400, y=(-400, -399.9), z=(-400, -399.9))
+    far["xyz"] += rng.uniform(-40, 0, 3)
+    one, other = drawn(*walls, T=T), drawn(*walls, far, T=T)
+    assert (np.abs(one - other) > 1e-3).mean() < 0.02  # a surfel at the border of a pixel may round to the next one
 
 
-def test_each_tile_draws_its_own_surfels():
-    surfels = np.concatenate([wall(5, y=(-5, 0)), wall(5, y=(0, 5))])
-    half = len(surfels) // 2
-    for first, left in ((0, False), (half, True)):
-        tiles = np.array([[0, 0, first, half]], np.float64)
-        found = render(surfels, tiles, tile_m=10.0, T_map_camera=AHEAD, camera=CAMERA, size_m=0.12, reach_m=40.0)
-        assert (found[:, :15] > 0).all() == left
-        assert (found[:, 17:] > 0).all() != left
-
-
-def test_an_empty_map_draws_an_empty_picture():
-    found = render(
-        np.zeros(0, SURFEL), np.zeros((0, 4)), tile_m=10.0, T_map_camera=AHEAD, camera=CAMERA, size_m=0.1, reach_m=40.0
+def test_a_map_without_regions_draws_an_empty_picture():
+    grid, surfels, _ = packed_map(wall(5), cell_m=0.4, reach_m=1.2)
+    empty = NearestGrid(
+        grid.origin_m, grid.cell_m, grid.slots, grid.regions[:0], grid.blocks[:0], grid.nearest[:0], grid.others
     )
+    found = render(empty, surfels[:0], T_map_camera=AHEAD, camera=CAMERA, size_m=0.1, reach_m=40.0)
     np.testing.assert_array_equal(found, np.zeros((24, 32)))

@@ -92,10 +92,10 @@ def test_a_small_pixel_is_seen_if_the_lens_saw_all_of_it():
 def painted(scene_of):
     """Return a wall 8 m ahead with dark and bright posters, and the image of a camera in front of it."""
     cloud = scene_of(((8, -12, -2), (0, 24, 0), (0, 0, 8))).survey(per_m2=400.0)
-    across, up = (cloud.surfels["xyz"] + cloud.origin_m)[:, 1:].T
+    across, up = (cloud.unpacked(np.s_[:])["xyz"] + cloud.origin_m)[:, 1:].T
     paint = np.random.default_rng(5).uniform(0.1, 1.0, (12, 32))
     bright = paint[((up + 2) / 0.75).astype(int).clip(0, 11), ((across + 12) / 0.75).astype(int).clip(0, 31)]
-    return replace(cloud, brightness=bright.astype(np.float32)), paint
+    return replace(cloud, brightness=bright.astype(np.float16)), paint
 
 
 def seen(paint, T_map_camera):
@@ -133,12 +133,12 @@ def test_a_size_of_its_own_does_not_matter(painted):
 
 def test_the_sensors_unit_does_not_matter(painted):
     cloud, paint = painted
-    other = replace(cloud, brightness=(cloud.brightness * np.float32(255)))
+    other = replace(cloud, brightness=(cloud.brightness * np.float16(255)))
     assert told(other, seen(paint, TRUE), TRUE) == pytest.approx(told(cloud, seen(paint, TRUE), TRUE), abs=1e-3)
 
 
 @pytest.mark.parametrize("brightness", [0.0, np.nan])
 def test_a_map_without_brightness_scores_zero(painted, brightness):
     cloud, paint = painted
-    blank = np.full(len(cloud.surfels), brightness, np.float32)
+    blank = np.full(len(cloud.surfels), brightness, np.float16)
     assert told(replace(cloud, brightness=blank), seen(paint, TRUE), TRUE) == 0.0

@@ -45,7 +45,7 @@ def map_of(scene_of):
 
     def made(*rectangles):
         surfels = scene_of(*rectangles).surfels()
-        return SurfelMap.prepare(ORIGIN, surfels, np.array([[10.0, 0.0, 0.0, len(surfels)]]))
+        return SurfelMap.prepare(ORIGIN, surfels)
 
     return made
 

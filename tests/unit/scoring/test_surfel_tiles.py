@@ -24,32 +24,23 @@ APART_M, BORDER_M, MARGIN_M = 60.0, 70.0, 50.0
 
 def clipped(cloud: SurfelMap, low_x: float, high_x: float) -> SurfelMap:
     """Return the surfels between two planes, map frame."""
-    x = cloud.surfels["xyz"][:, 0] + cloud.origin_m[0]
-    kept, first, tiles = [], 0, []
-    for row in cloud.tiles:
-        begin, end = int(row[2]), int(row[2] + row[3])
-        inside = begin + np.flatnonzero((x[begin:end] >= low_x) & (x[begin:end] < high_x))
-        kept.append(inside)
-        tiles.append([row[0], row[1], first, len(inside)])
-        first += len(inside)
-    rows = np.concatenate(kept)
-    brightness = None if cloud.brightness is None else cloud.brightness[rows]
-    return SurfelMap.prepare(
-        cloud.origin_m, np.ascontiguousarray(cloud.surfels[rows]), np.array(tiles, np.float64), brightness
-    )
+    surfels = cloud.unpacked(np.s_[:])
+    x = surfels["xyz"][:, 0] + cloud.origin_m[0]
+    rows = np.flatnonzero((x >= low_x) & (x < high_x))
+    brightness = None if cloud.brightness is None else cloud.brightness[rows].astype(np.float32)
+    return SurfelMap.prepare(cloud.origin_m, surfels[rows], brightness)
 
 
 @pytest.fixture(scope="module")
 def clouds(street_map):
     """Four copies of the street, 40 m apart, and the same in two tiles that meet at x = 70 m."""
-    surfels, tiles = [], []
+    surfels = []
     for copy in range(4):
-        moved = street_map.surfels.copy()
+        moved = street_map.unpacked(np.s_[:])
         moved["xyz"][:, 0] += 40.0 * copy
-        tiles.append([9.0 + 40.0 * copy, 0.0, copy * len(moved), len(moved)])
         surfels.append(moved)
     joined = np.concatenate(surfels)
-    whole = SurfelMap.prepare(np.zeros(3), joined, np.array(tiles), np.linspace(1, 2, len(joined), dtype=np.float32))
+    whole = SurfelMap.prepare(np.zeros(3), joined, np.linspace(1, 2, len(joined), dtype=np.float32))
     parts = (clipped(whole, -np.inf, BORDER_M + MARGIN_M), clipped(whole, BORDER_M - MARGIN_M, np.inf))
     squares_m = np.array([[-1e4, -1e4, BORDER_M, 1e4], [BORDER_M, -1e4, 1e4, 1e4]])
     return whole, SurfelTiles(squares_m, parts.__getitem__, np.zeros(3), True, lambda: range(2))

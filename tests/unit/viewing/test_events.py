@@ -37,7 +37,7 @@ def test_a_map_shows_cloud_places_and_streets_all_the_time(bundle_path):
     bundle = MapBundle.open(bundle_path)
     assert bundle.cloud is not None
     assert isinstance(cloud, Cloud)
-    np.testing.assert_allclose(cloud.points_m[0], bundle.cloud.surfels["xyz"][0], atol=1e-5)
+    np.testing.assert_allclose(cloud.points_m[0], bundle.cloud.unpacked(np.s_[:1])["xyz"][0], atol=1e-5)
     assert isinstance(places, Track)
     assert len(places.positions_m) == 12
     assert isinstance(streets, Outlines)
