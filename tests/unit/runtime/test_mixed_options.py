@@ -182,7 +182,7 @@ def test_options_of_one_frame_do_not_change_the_next_answer(
         stream.localize(replace(frame, **changed), None)
         answers.append(stream.localize(frame, np.eye(4))[0].answer)
     expected, found = answers
-    # A frame without registration leaves no belief. So the next registration has no starts from it and may meet other rivals: another start may win.
+    # A frame without registration leaves no belief. So the next registration has no starts from it, and another start may win.
     refined = first.get("refine", True)
     assert found.T_map_camera_guess is not None
     assert expected.T_map_camera_guess is not None
