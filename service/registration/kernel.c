@@ -591,7 +591,7 @@ void streetfix_pack(const Grid *g, const Surfel *surfels, const int64_t *rows, i
             y = (1 - fabs(x)) * (y < 0 ? -1 : 1), x = folded;
         }
         packed[i].normal[0] = (int16_t)lround(x * NORMAL_STEPS), packed[i].normal[1] = (int16_t)lround(y * NORMAL_STEPS);
-        packed[i].thickness = (uint8_t)clamped(round(sqrt((double)m->thickness_m / THICKNESS_M)), UINT8_MAX);
+        packed[i].thickness = (uint8_t)clamped(round(sqrt(m->thickness_m > 0 ? (double)m->thickness_m / THICKNESS_M : 0)), UINT8_MAX);
         packed[i].points = m->points ? (uint8_t)clamped(1 + round(log((double)m->points) / POINTS_LOG), UINT8_MAX) : 0;
     }
 }
@@ -652,10 +652,10 @@ void streetfix_render(const PackedSurfel *surfels, const Cube *cubes, int64_t cu
         const Cube *cube = cubes + n;
         double e[3];
         for (int a = 0; a < 3; a++) e[a] = cube->corner[a] + half_edge - t[a];
-        if (e[0] * e[0] + e[1] * e[1] + e[2] * e[2] > (reach + radius) * (reach + radius)) continue;
-        /* Skip cubes beside and behind the field of view. */
+        /* Skip cubes beyond the reach, which limits the depth, and those beside and behind the field of view. */
         const double ahead = R[2] * e[0] + R[5] * e[1] + R[8] * e[2], beside = R[0] * e[0] + R[3] * e[1] + R[6] * e[2];
-        if (ahead < -radius || beside - right * ahead > hypot(1, right) * radius || left * ahead - beside > hypot(1, left) * radius)
+        if (ahead > reach + radius || ahead < -radius || beside - right * ahead > hypot(1, right) * radius ||
+            left * ahead - beside > hypot(1, left) * radius)
             continue;
         const float tx = (float)(t[0] - cube->corner[0]), ty = (float)(t[1] - cube->corner[1]), tz = (float)(t[2] - cube->corner[2]);
         const PackedSurfel *m = surfels + cube->first, *end = m + cube->count;

@@ -291,8 +291,13 @@ class NearestGrid:
         Args:
             surfels: of the map, (S,) of ``PACKED_SURFEL``.
             rows: rows in ``surfels`` (n,), fastest if ascending.
+
+        Raises:
+            IndexError: a row is outside the surfels. The library does not check it.
         """
         rows, found = np.ascontiguousarray(rows, np.int64), np.empty(len(rows), SURFEL)
+        if len(rows) and not 0 <= int(rows.min()) <= int(rows.max()) < len(surfels):
+            raise IndexError(f"a row is outside the {len(surfels)} surfels")
         _library().streetfix_unpack(
             self.cell_m,
             self.cubes.ctypes.data,
@@ -461,8 +466,12 @@ def packed_map(
         The grid, the surfels (S,) of ``PACKED_SURFEL`` sorted by region, and their rows in ``surfels`` (S,).
 
     Raises:
-        StreetfixError: the surfels lie too far from each other for the numbers of the regions.
+        StreetfixError: the surfels lie too far from each other for the numbers of the regions, or a number is not finite.
     """
+    surfels = np.ascontiguousarray(surfels, SURFEL)
+    for name in ("xyz", "normal", "thickness_m"):
+        if not np.isfinite(surfels[name]).all():
+            raise StreetfixError(f"surfels: a number of {name} is not finite; leave out what the scans measured there")
     low, high = surfels["xyz"].min(axis=0).astype(np.float64), surfels["xyz"].max(axis=0).astype(np.float64)
     origin = low - reach_m - 2 * cell_m
     extent_m, most_m = float((high + reach_m - origin).max()), (1 << KEY_BITS) * REGION * BLOCK * cell_m
@@ -497,7 +506,7 @@ def packed_map(
     slot_bits = max(1, (2 * len(whole) - 1).bit_length())
     slots = np.full(1 << slot_bits, -1, np.int32)
     _library().streetfix_fill_slots(whole.ctypes.data, len(whole), slot_bits, slots.ctypes.data)
-    # Two bytes are enough unless a region has 65,536 surfels. Then all numbers of the map take four.
+    # Two bytes are enough unless a region numbers more than 65,536 surfels. Then all numbers of the map take four.
     entries = np.concatenate(nearest)
     grid = NearestGrid(origin, cell_m, slots, whole, np.concatenate(blocks), entries, np.concatenate(others))
     return grid, packed, order

@@ -25,9 +25,11 @@ from service.registration.kernel import (
 
 #: Edge of a cell of the lookup grid, and largest distance from a surfel to a cell that refers to it, m.
 CELL_M, REACH_M = 0.4, 1.2
+#: Largest coordinate of the corner of a grid, and largest edge of a cell, m. A damaged file may hold any number.
+MOST_AWAY_M, LARGEST_CELL_M = 1e7, 10.0
 
 _FLOATS, _NUMBERS, _BRIGHT = np.dtype("<f8"), np.dtype("<i4"), np.dtype("<f2")
-#: Name of the array of intensities. Maps of earlier releases, or of a sensor without intensity, do not have it.
+#: Name of the array of intensities. Maps of a sensor without intensity do not have it.
 BRIGHTNESS = "brightness"
 #: Type and shape of every other array by name; -1 is any length.
 _EXPECTED: dict[str, tuple[np.dtype[Any], tuple[int, ...]]] = {
@@ -78,10 +80,10 @@ class SurfelMap:
                 without intensity and counts as None.
         """
         grid, packed, order = packed_map(surfels, cell_m=CELL_M, reach_m=REACH_M)
-        if brightness is None or not (brightness > 0).any():
+        if brightness is None:
             return cls(origin_m, packed, grid)
-        most = np.finfo(_BRIGHT).max
-        return cls(origin_m, packed, grid, np.minimum(brightness[order], most).astype(_BRIGHT))
+        half = np.minimum(brightness[order], np.finfo(_BRIGHT).max).astype(_BRIGHT)
+        return cls(origin_m, packed, grid, half if (half > 0).any() else None)
 
     def unpacked(self, rows: NDArray[np.integer[Any]] | slice) -> NDArray[Any]:
         """Return surfels as numbers: (n,) of ``SURFEL``, in the surfels' frame.
@@ -182,6 +184,11 @@ class SurfelMap:
                 BRIGHTNESS, f"{brightness.dtype} of shape {brightness.shape} instead of one {_BRIGHT} per surfel"
             )
         frame = np.array(arrays["grid_frame"])
+        if not (np.abs(frame[:3]) <= MOST_AWAY_M).all() or not 0 < frame[3] <= LARGEST_CELL_M:
+            raise _defect(
+                "grid_frame",
+                f"the corner is not within {MOST_AWAY_M:g} m, or the edge of a cell not between 0 and {LARGEST_CELL_M:g} m",
+            )
         parts = ("slots", "regions", "blocks", "nearest", "others")
         grid = NearestGrid(frame[:3], float(frame[3]), *(arrays[f"grid_{name}"] for name in parts))
         found = cls(np.array(arrays["origin"]), arrays["surfels"], grid, brightness)
@@ -195,8 +202,8 @@ class SurfelMap:
         Raises:
             BundleError: an index refers outside its array, or a number is not finite or otherwise invalid. The error names the array.
         """
-        if not np.isfinite(self.grid.origin_m).all() or not self.grid.cell_m > 0:
-            raise _defect("grid_frame", "the origin is not finite, or the cell size is not positive")
+        if not len(self.surfels):
+            raise _defect("surfels", "there is none")
         _require_levels(self.grid)
         _require_surfels(self.grid, len(self.surfels))
         if not np.isfinite(self.origin_m).all():

@@ -1,6 +1,6 @@
 """Cast the rays of a small image on the map: each surfel is a disc in its own plane.
 
-One request casts rays from several poses that are metres apart. A camera sees a tenth of the tiles around these poses. So the
+One request casts rays from several poses that are metres apart. A camera sees a tenth of the regions around these poses. So the
 surfels that are visible from anywhere near a pose are collected once and reused.
 """
 

@@ -144,7 +144,7 @@ def street() -> Scene:
 
 @pytest.fixture(scope="session")
 def street_map(street: Scene) -> SurfelMap:
-    """Return surfels exactly on the rectangles of the street, in one tile."""
+    """Return surfels exactly on the rectangles of the street."""
     surfels = street.surfels()
     return SurfelMap.prepare(np.zeros(3), surfels)
 

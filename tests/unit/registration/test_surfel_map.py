@@ -1,9 +1,12 @@
+from typing import Any
+
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from scipy.spatial import cKDTree
 
-from service.errors import BundleError
+from service.errors import BundleError, StreetfixError
 from service.registration.kernel import PACKED_SURFEL, SURFEL, SolverOptions, align, packed_map
 from service.registration.surfel_map import SurfelMap
 
@@ -175,10 +178,13 @@ def test_a_level_of_the_grid_that_points_outside_is_refused(arrays, name, field,
     refused(arrays, name, what)
 
 
-@pytest.mark.parametrize(("entry", "value"), [(0, np.nan), (2, np.inf), (3, np.nan), (3, 0.0), (3, -0.4)])
+@pytest.mark.parametrize(
+    ("entry", "value"),
+    [(0, np.nan), (2, np.inf), (1, 1e300), (3, np.nan), (3, 0.0), (3, -0.4), (3, np.inf), (3, 1e300)],
+)
 def test_a_frame_that_is_none_is_refused(arrays, entry, value):
     arrays["grid_frame"][entry] = value
-    refused(arrays, "grid_frame", "the origin is not finite, or the cell size is not positive")
+    refused(arrays, "grid_frame", "the corner is not within .* m, or the edge of a cell not between 0 and 10 m")
 
 
 def test_an_origin_that_is_none_is_refused(arrays):
@@ -241,25 +247,71 @@ def test_numbers_beyond_the_codes_become_the_largest_ones():
     np.testing.assert_allclose(found["points"], [2**32 - 1, 1], rtol=0.05)
 
 
-def test_a_region_with_many_surfels_numbers_them_in_four_bytes(start_at, points_at):
-    """70,000 surfels on one square metre, and a few 25 m away. The same points register alike on a thinned floor."""
+def test_a_region_with_many_surfels_numbers_them_in_four_bytes():
+    """70,000 surfels in one region of 25.6 m. Every cell refers to the nearest one."""
     rng = np.random.default_rng(4)
     surfels = np.zeros(70_000, SURFEL)
-    surfels["xyz"][:, :2], surfels["normal"] = rng.uniform(0, 8, (70_000, 2)), [0, 0, 1]
-    surfels["xyz"][:100, 0] += 25
+    surfels["xyz"], surfels["normal"] = rng.uniform(0, [20, 20, 2], (70_000, 3)), [0, 0, 1]
     cloud = SurfelMap.prepare(np.zeros(3), surfels)
     assert cloud.grid.nearest.dtype == np.uint32
-    cloud = SurfelMap.from_arrays(cloud.arrays())
-    options = SolverOptions(iterations=5, reach=1.2, robust_first=1.0, robust_last=0.1)
-    points, states = points_at([[1.0, 1, -1.4], [-1, 1, -1.4], [0.5, -1, -1.4], [-1, -1, -1.4]]), []
-    for each in (cloud, SurfelMap.prepare(np.zeros(3), surfels[::2].copy())):
-        states.append(start_at(np.eye(3), [4.0, 4.0, 1.5]))
-        each.align(points, states[-1], options)
-    np.testing.assert_allclose(states[0]["t"], states[1]["t"], atol=1e-3)
-    assert states[0]["inliers"][0] > 0.95
+    grid = SurfelMap.from_arrays(cloud.arrays()).grid
+    cells = np.unique(np.floor((rng.uniform(1, [19, 19, 2], (4000, 3)) - grid.origin_m) / grid.cell_m), axis=0)
+    centres = grid.origin_m + (cells + 0.5) * grid.cell_m
+    xyz = cloud.unpacked(np.s_[:])["xyz"]
+    tree: Any = cKDTree(xyz)
+    distance, _ = tree.query(centres)
+    rows = grid.surfels_at(centres)
+    assert (rows > 1 << 16).any()
+    np.testing.assert_allclose(np.linalg.norm(xyz[rows] - centres, axis=1), distance, atol=1e-5)
 
 
-def test_a_map_of_an_earlier_release_has_no_brightness(arrays):
+@pytest.mark.parametrize("field", ["xyz", "normal", "thickness_m"])
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_a_surfel_that_is_not_finite_is_not_packed(field, value):
+    surfels = np.zeros(3, SURFEL)
+    surfels[field][1] = value
+    with pytest.raises(StreetfixError, match=f"a number of {field} is not finite"):
+        SurfelMap.prepare(np.zeros(3), surfels)
+
+
+def test_a_negative_thickness_counts_as_none():
+    surfels = np.zeros(1, SURFEL)
+    surfels["thickness_m"] = -1e-9
+    assert packed(surfels)[0]["thickness_m"] == 0
+
+
+def test_a_slice_of_surfels_is_packed_as_its_copy():
+    surfels = np.zeros(6, SURFEL)
+    surfels["xyz"][:, 0] = np.arange(6)
+    np.testing.assert_allclose(packed(surfels[::2])[0]["xyz"][:, 0], [0, 2, 4], atol=1e-3)
+
+
+@pytest.mark.parametrize("row", [-1, 10**6])
+def test_a_row_outside_the_surfels_is_refused(cloud, row):
+    with pytest.raises(IndexError, match="a row is outside the"):
+        cloud.unpacked(np.array([0, row]))
+
+
+def test_a_map_without_a_surfel_is_refused(arrays):
+    for name in ("surfels", "grid_regions", "grid_blocks", "grid_nearest", "grid_others", "brightness"):
+        arrays[name] = arrays[name][:0]
+    arrays["grid_slots"] = np.full(2, -1, np.int32)
+    refused(arrays, "surfels", "there is none")
+
+
+@pytest.mark.parametrize("brightest", [0.0, 1e-9])
+def test_a_brightness_that_is_nothing_in_half_precision_is_none(brightest):
+    surfels = np.zeros(2, SURFEL)
+    assert SurfelMap.prepare(np.zeros(3), surfels, np.array([0.0, brightest], np.float32)).brightness is None
+
+
+def test_a_brightness_beyond_half_precision_becomes_the_largest_one():
+    found = SurfelMap.prepare(np.zeros(3), np.zeros(2, SURFEL), np.array([1e6, np.nan], np.float32)).brightness
+    assert found is not None
+    np.testing.assert_array_equal(found, np.float16([65504, np.nan]))
+
+
+def test_a_map_may_have_no_brightness(arrays):
     del arrays["brightness"]
     found = SurfelMap.from_arrays(arrays)
     assert found.brightness is None
