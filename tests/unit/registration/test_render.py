@@ -97,7 +97,7 @@ def slowly_drawn(grid, surfels, T, camera, *, size_m, reach_m):
 def test_regions_that_are_left_out_have_nothing_to_draw(seed, heading, pitch, roll, focal_px):
     """Walls up to 60 m away, images of 77 to 139 degrees. The reach limits the depth, so the sides of an image see further."""
     rng = np.random.default_rng(seed)
-    camera = PinholeCamera(32, 24, *focal_px, 15.5, 11.5)
+    camera = PinholeCamera(32, 24, focal_px[0], focal_px[1], 15.5, 11.5)
     walls = [wall(x, y=(y, y + 6), z=(z, z + 6), step=0.5) for x, y, z in rng.uniform(-60, 60, (40, 3))]
     R = Rotation.from_euler("zyx", [heading, pitch, roll], degrees=True).as_matrix() @ R_BODY_OPTICAL
     T = transform_from(R, rng.uniform(-20, 20, 3))

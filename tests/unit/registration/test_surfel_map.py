@@ -308,7 +308,7 @@ def test_a_brightness_that_is_nothing_in_half_precision_is_none(brightest):
 def test_a_brightness_beyond_half_precision_becomes_the_largest_one():
     found = SurfelMap.prepare(np.zeros(3), np.zeros(2, SURFEL), np.array([1e6, np.nan], np.float32)).brightness
     assert found is not None
-    np.testing.assert_array_equal(found, np.float16([65504, np.nan]))
+    np.testing.assert_array_equal(found, np.array([65504, np.nan], np.float16))
 
 
 def test_a_map_may_have_no_brightness(arrays):
