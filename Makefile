@@ -4,13 +4,9 @@
 PYTHON ?= python3
 # The CPU build where pip is offered one; `make TORCH="torch==2.13.0 --index-url ..." test` takes another.
 TORCH ?= torch==2.13.0
-# Optimiser steps of the stock encoder, and of its second round at half the rate.
-STEPS ?= 6600
-SECOND_STEPS ?= 4000
-THIRD_STEPS ?= 1500
-FOURTH_STEPS ?= 5000
-FIFTH_STEPS ?= 7000
-SIXTH_STEPS ?= 15000
+# Optimiser steps of the two trainings of the stock encoder. Its weights are the mean of the weights after both.
+STEPS ?= 15000
+SECOND_STEPS ?= 11000
 # Further steps on the paper's city, for the encoder that stands beside it in the report.
 PAPER_STEPS ?= 400
 # Real stereo frames in KITTI's object layout.
@@ -186,13 +182,9 @@ pictures: .venv/.torch ## the pictures of README and docs
 	$(BIN)/python -m benchmarks.pictures $(ARGS)
 
 encoder: .venv/.torch ## train and export the stock encoder again; resumes an interrupted run
-	$(BIN)/streetfix train --run runs/stock --cities 26 --turn 7.5 --steps $(STEPS) --precision bfloat16
-	$(BIN)/streetfix train --run runs/second --cities 26 --turn 7.5 --steps $(SECOND_STEPS) --rate 1e-3 --seed 7 --precision bfloat16 --start-from runs/stock
-	$(BIN)/streetfix train --recipe matched --run runs/third --turn 7.5 --steps $(THIRD_STEPS) --rate 6e-4 --seed 11 --start-from runs/second
-	$(BIN)/streetfix train --recipe rigs --run runs/fourth --turn 7.5 --steps $(FOURTH_STEPS) --rate 1e-3 --seed 13 --precision bfloat16 --start-from runs/third
-	$(BIN)/streetfix train --recipe rigs --run runs/fifth --turn 7.5 --steps $(FIFTH_STEPS) --rate 1e-3 --seed 17 --precision bfloat16 --start-from runs/fourth
-	$(BIN)/streetfix train --recipe streets --run runs/sixth --turn 7.5 --steps $(SIXTH_STEPS) --pairs 256 --rate 1e-3 --seed 19 --precision bfloat16 --start-from runs/fifth
-	$(BIN)/streetfix average runs/fifth runs/sixth --run runs/mean
+	$(BIN)/streetfix train --recipe streets --run runs/first --turn 7.5 --steps $(STEPS) --pairs 256 --seed 19 --precision bfloat16
+	$(BIN)/streetfix train --recipe more-streets --run runs/second --turn 7.5 --steps $(SECOND_STEPS) --pairs 256 --rate 1e-3 --seed 23 --precision bfloat16 --start-from runs/first
+	$(BIN)/streetfix average runs/first runs/second --run runs/mean
 	$(BIN)/streetfix export runs/mean --out runs/mean/encoder.onnx
 	$(BIN)/streetfix quantize runs/mean/encoder.onnx --cities 6 --seed 3 --out model_training/stock/encoder.onnx
 
@@ -200,7 +192,7 @@ calibration: .venv/.torch ## run the calibration cities and fit confidence again
 	$(BIN)/streetfix calibrate --anew $(ARGS)
 
 paper-encoder: .venv/.torch ## the stock encoder, trained further on the paper's city
-	$(BIN)/streetfix train --recipe paper --start-from runs/third --rate 5e-4 --steps $(PAPER_STEPS) --precision bfloat16 --run runs/paper
+	$(BIN)/streetfix train --recipe paper --start-from model_training/stock/encoder.onnx --rate 5e-4 --steps $(PAPER_STEPS) --precision bfloat16 --run runs/paper
 	$(BIN)/streetfix export runs/paper --out runs/paper/encoder.onnx
 
 install-demo: .venv/.mapping ## install only what the demo needs

@@ -29,9 +29,8 @@ def command(
     recipe: Annotated[
         str,
         typer.Option(
-            help="stock: many cities. matched: some of them, and cities with stereo-matched depth. rigs: as matched, and "
-            "cities that random rigs ask, from a small robot to a lorry. streets: many small cities, for a GPU. paper: the paper's "
-            "city itself."
+            help="stock: cities with modelled depth errors. streets: 60 small cities, most with stereo-matched depth, from a small "
+            "robot to a lorry. more-streets: 53 others of this kind. paper: the paper's city itself."
         ),
     ] = "stock",
     cities: Annotated[
@@ -83,12 +82,12 @@ def command(
     Ctrl-C saves a checkpoint. The same command then resumes the training.
 
     \b
-    Example, the stock encoder:
-      streetfix train --run runs/stock && streetfix export runs/stock --out encoder.onnx
+    Example, an encoder of your own:
+      streetfix train --run runs/mine && streetfix export runs/mine --out encoder.onnx
     \b
     Example, four processes of one machine that resume up to three times after a failure:
       torchrun --standalone --nproc-per-node 4 --max-restarts 3 --no-python -- \\
-        streetfix train --run runs/stock
+        streetfix train --run runs/mine
     """
     if recipe not in RECIPES:
         raise DatasetError(f"recipe: {recipe!r} is not valid; choose one of: {', '.join(RECIPES)}", field="recipe")

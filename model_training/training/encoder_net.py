@@ -40,8 +40,8 @@ class EncoderShape(BaseModel):
 
     rows: int = 32
     columns: int = 128
-    widths: tuple[int, int, int, int] = (16, 48, 128, 192)
-    narrow: int = 96
+    widths: tuple[int, int, int, int] = (24, 72, 192, 256)
+    narrow: int = 128
     descriptor: int = 256
 
 

@@ -6,14 +6,14 @@ The paper's city belongs to the evaluation too.
 """
 
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from itertools import cycle, islice
 
 from model_training.simulation.exposure import RGBS
 from model_training.simulation.plan import CameraPlan
 from model_training.simulation.stereo_pair import STEREOS
 from model_training.training.matched_views import MatchedRig
-from model_training.training.packs import DRIVE_VIEWS, PackPlan
+from model_training.training.packs import PackPlan
 from model_training.training.random_rigs import HEIGHT_M, random_rigs
 
 #: Seeds of the training cities.
@@ -40,12 +40,12 @@ _LIDARS = (
 )
 
 
-#: Training cities of the stock encoder.
+#: Cities of the recipe ``stock``.
 STOCK_CITIES = 26
 
 
 def stock_plans(cities: int) -> list[PackPlan]:
-    """Plan the training set of the stock encoder.
+    """Plan cities with modelled depth errors, the default of ``train``. A processor alone trains on them in an hour or two.
 
     Args:
         cities: number of cities.
@@ -81,38 +81,6 @@ MATCHED_RIGS = (
         *_MACHINE,
     ),
 )
-#: Index of the first seed of ``matched_plans``, after those of the stock recipe.
-_MATCHED_FROM = 40
-_MATCHED_LIDARS = ("hdl_64", "hdl_32", "hdl_64", "os1_64", "hdl_64")
-
-
-#: Clean and matched cities of the matched recipe. The clean ones keep the encoder from forgetting what it learnt.
-_CLEAN_BESIDE, _MATCHED = 6, 5
-#: Matched cities of a car and a small robot in the recipe of random rigs.
-_CAR_BESIDE = 5
-
-
-def matched_plans(cities: int = _MATCHED) -> list[PackPlan]:
-    """Plan cities of mixed districts whose queries have stereo-matched depth.
-
-    Args:
-        cities: number of cities.
-    """
-    return [
-        PackPlan(
-            seed=TRAINING_SEEDS[_MATCHED_FROM + k],
-            name="mixed",
-            places=1000,
-            queries_a_place=1,
-            lidar=_MATCHED_LIDARS[k % len(_MATCHED_LIDARS)],
-            rigs=MATCHED_RIGS,
-        )
-        for k in range(cities)
-    ]
-
-
-#: Index of the first seed of ``rig_plans``, after those of the matched recipe.
-_RIGS_FROM = 60
 #: LiDAR, its height (m) and kind of city, one after the other.
 _SURVEYS = (
     ("hdl_64", 1.73, "mixed"),
@@ -126,49 +94,55 @@ _SURVEYS = (
     ("hdl_64", 1.73, "mixed"),
     ("hdl_32", 1.8, "mixed"),
 )
-#: Cities with stereo-matched and with modelled depth, and places of each.
-_RIG_MATCHED, _RIG_MODELLED, _RIG_PLACES = 8, 6, 960
-
-
-def rig_plans() -> list[PackPlan]:
-    """Plan cities that are asked by random rigs: first with stereo-matched depth, then with modelled depth."""
-    plans = [
-        PackPlan(
-            seed=TRAINING_SEEDS[_RIGS_FROM + k],
-            name=kind,
-            places=_RIG_PLACES,
-            queries_a_place=1 if k < _RIG_MATCHED else 2,
-            lidar=lidar,
-            lidar_height_m=height_m,
-            camera_height_m=HEIGHT_M,
-        )
-        for k, (lidar, height_m, kind) in enumerate(islice(cycle(_SURVEYS), _RIG_MATCHED + _RIG_MODELLED))
-    ]
-    rigs = -(-_RIG_PLACES // DRIVE_VIEWS)
-    return [
-        replace(plan, rigs=random_rigs(plan.seed, rigs)) if k < _RIG_MATCHED else plan for k, plan in enumerate(plans)
-    ]
-
-
-#: Index of the first seeds of ``street_plans``: low and high cameras with modelled depth, rigs of a car, random rigs.
-_LOW_AND_HIGH_FROM, _CARS_FROM, _RANDOM_FROM = 200, 300, 400
-#: Cities of each kind in ``street_plans``; the first ones are cities of the stock recipe.
-_STREETS = {"stock": 11, "low_and_high": 8, "cars": 21, "random": 20}
 #: Places of a city with stereo-matched depth. Small packs are ready soon, so a training sees many cities.
 _STREET_PLACES = 480
 _CAR_LIDARS = ("hdl_64", "hdl_64", "hdl_32", "hdl_64", "os1_64")
 
 
+@dataclass(frozen=True, slots=True)
+class _Streets:
+    """Indices of the first seeds, and numbers of cities, of one training on many small cities.
+
+    Attributes:
+        stock: cities with modelled depth, as in the stock recipe.
+        low_and_high: cities with modelled depth, and cameras at 0.3 to 3.2 m.
+        cars: cities with stereo-matched depth of a car's rig and of a hand-held rig.
+        random: cities with stereo-matched depth of random rigs.
+    """
+
+    stock: tuple[int, int]
+    low_and_high: tuple[int, int]
+    cars: tuple[int, int]
+    random: tuple[int, int]
+
+
+_STREETS = _Streets(stock=(0, 11), low_and_high=(200, 8), cars=(300, 21), random=(400, 20))
+_MORE_STREETS = _Streets(stock=(500, 11), low_and_high=(600, 7), cars=(700, 18), random=(800, 17))
+
+
 def street_plans() -> list[PackPlan]:
-    """Plan 60 small cities, more than half with suburbs and hedges: the training on a GPU (decision 0171)."""
-    stock = [replace(plan, places=1056) for plan in stock_plans(_STREETS["stock"])]
-    low_and_high = [
-        replace(plan, places=2 * _STREET_PLACES, queries_a_place=2)
-        for plan in _surveyed(_LOW_AND_HIGH_FROM, _STREETS["low_and_high"])
+    """Plan 60 small cities, more than half with suburbs and hedges: the first training of the stock encoder."""
+    return _many_small(_STREETS)
+
+
+def more_street_plans() -> list[PackPlan]:
+    """Plan 53 further small cities of the same kinds: the second training of the stock encoder."""
+    return _many_small(_MORE_STREETS)
+
+
+def _many_small(streets: _Streets) -> list[PackPlan]:
+    """Plan the cities of one training, each kind after the other."""
+    first, cities = streets.stock
+    stock = [
+        PackPlan(seed=TRAINING_SEEDS[first + k], places=1056, lidar=_LIDARS[k % len(_LIDARS)]) for k in range(cities)
     ]
+    low_and_high = [
+        replace(plan, places=2 * _STREET_PLACES, queries_a_place=2) for plan in _surveyed(*streets.low_and_high)
+    ]
+    first, cities = streets.cars
     cars = [
         PackPlan(
-            seed=TRAINING_SEEDS[_CARS_FROM + k],
+            seed=TRAINING_SEEDS[first + k],
             name="mixed" if k % 5 else "city",
             places=_STREET_PLACES,
             queries_a_place=1,
@@ -176,9 +150,9 @@ def street_plans() -> list[PackPlan]:
             lidar_height_m=1.73,
             rigs=(MATCHED_RIGS[0], MATCHED_RIGS[2], MATCHED_RIGS[0], MATCHED_RIGS[1 if k % 2 else 3]),
         )
-        for k in range(_STREETS["cars"])
+        for k in range(cities)
     ]
-    surveyed = _surveyed(_RANDOM_FROM, _STREETS["random"])
+    surveyed = _surveyed(*streets.random)
     return stock + low_and_high + cars + [replace(plan, rigs=random_rigs(plan.seed, 16)) for plan in surveyed]
 
 
@@ -211,8 +185,7 @@ def paper_plans() -> list[PackPlan]:
 #: Recipes by name. Each gets the number of cities; only the stock recipe uses it.
 RECIPES: dict[str, Callable[[int], list[PackPlan]]] = {
     "stock": stock_plans,
-    "matched": lambda _: [*stock_plans(_CLEAN_BESIDE), *matched_plans()],
-    "rigs": lambda _: [*stock_plans(_CLEAN_BESIDE), *matched_plans(_CAR_BESIDE), *rig_plans()],
     "streets": lambda _: street_plans(),
+    "more-streets": lambda _: more_street_plans(),
     "paper": lambda _: paper_plans(),
 }

@@ -24,9 +24,8 @@ from model_training.training.recipe import (
     STOCK_CITIES,
     TRAINING_SEEDS,
     WATCH_SEEDS,
-    matched_plans,
+    more_street_plans,
     paper_plans,
-    rig_plans,
     stock_plans,
     street_plans,
     watch_plans,
@@ -132,34 +131,24 @@ def test_training_is_watched_on_cities_of_its_own():
     assert {plan.seed for plan in watch_plans()} <= set(WATCH_SEEDS)
 
 
-def test_cities_of_matched_pairs_are_none_of_the_stock_recipes():
-    matched = {plan.seed for plan in matched_plans(20)}
-    assert len(matched) == 20
-    assert matched <= set(TRAINING_SEEDS)
-    assert not matched & {plan.seed for plan in stock_plans(40)}
-    assert all(plan.rigs for plan in RECIPES["matched"](1)[-5:])
-
-
-def test_cities_of_random_rigs_are_cities_of_their_own():
-    others = {plan.seed for plan in [*stock_plans(STOCK_CITIES), *matched_plans(20)]}
-    plans = rig_plans()
-    assert {plan.seed for plan in plans} <= set(TRAINING_SEEDS)
-    assert not {plan.seed for plan in plans} & others
-    assert len({plan.seed for plan in plans}) == len(plans)
-    assert set(rig_plans()) <= set(RECIPES["rigs"](1))
-    assert {bool(plan.rigs) for plan in plans} == {True, False}
-    assert all(plan.camera_height_m == HEIGHT_M for plan in plans)
-
-
-def test_the_recipe_of_many_small_cities_has_seeds_of_its_own_except_those_of_the_stock_recipe():
-    plans = street_plans()
+def test_the_trainings_on_many_small_cities_share_only_cities_of_the_stock_recipe():
+    first, second = street_plans(), more_street_plans()
+    seeds = [{plan.seed for plan in plans} for plans in (first, second)]
     stock = {plan.seed for plan in stock_plans(STOCK_CITIES)}
-    earlier = stock | {plan.seed for plan in [*matched_plans(20), *rig_plans()]}
-    assert len({plan.seed for plan in plans}) == len(plans) == 60
-    assert {plan.seed for plan in plans} <= set(TRAINING_SEEDS)
-    assert {plan.seed for plan in plans} & earlier <= stock
-    assert sum(bool(plan.rigs) for plan in plans) == 41
-    assert RECIPES["streets"](1) == plans
+    assert [len(each) for each in seeds] == [len(first), len(second)] == [60, 53]
+    assert seeds[0] | seeds[1] <= set(TRAINING_SEEDS)
+    assert not seeds[0] & seeds[1]
+    assert len(seeds[0] & stock) == 11
+    assert not seeds[1] & stock
+    assert RECIPES["streets"](1) == first
+    assert RECIPES["more-streets"](1) == second
+
+
+@pytest.mark.parametrize(("plans", "matched"), [(street_plans(), 41), (more_street_plans(), 35)])
+def test_many_small_cities_have_matched_depth_and_cameras_of_all_heights(plans, matched):
+    assert sum(bool(plan.rigs) for plan in plans) == matched
+    assert {plan.name for plan in plans} == {"city", "mixed"}
+    assert sum(plan.camera_height_m == HEIGHT_M for plan in plans if not plan.rigs) in (7, 8)
 
 
 def test_random_rigs_cover_the_range_and_no_two_are_the_same():
@@ -254,7 +243,7 @@ def test_a_pack_without_matching_has_no_mask(pack):
 def test_the_papers_city_is_only_in_its_own_recipe():
     assert {plan.name for plan in paper_plans()} == {"paper"}
     assert {plan.name for plan in stock_plans(50) + watch_plans()} == {"city"}
-    assert {plan.name for plan in matched_plans(20)} == {"mixed"}
+    assert not {plan.name for plan in street_plans() + more_street_plans()} - {"city", "mixed"}
 
 
 def test_plans_that_differ_have_packs_of_their_own():
