@@ -58,11 +58,11 @@ _BORDERS = (
     "of the vote gained half a point in four other cities, and nothing here"
 )
 _HEIGHTS = (
-    "Confidence causes most losses: forced answers within 1 m are 0.935, 0.935, 0.95, 0.97, 0.98 and 0.985 from 0.2 to 3.5 m, and at "
-    "most 0.01 are accepted and wrong. The default needs a confidence of 0.9 since decision 0149. Tried: training on cameras of 0.3 to "
-    "3.2 m (decision 0154; forced at 0.2 m 0.815 -> 0.93), depth structure and confirmation (decisions 0159 and 0165; accepted at 0.2 m "
-    "0.775 -> 0.88, at 3.5 m 0.885 -> 0.93). A given height gains nothing, because the estimate "
-    "errs by 0.02 to 0.04 m. Next: low and high cameras in the calibration"
+    "Confidence causes most losses: forced answers within 1 m are 0.935, 0.935, 0.975, 0.98, 0.99 and 0.985 from 0.2 to 3.5 m. At 0.4 m 4 "
+    "of 200 are accepted and wrong, elsewhere none. The default needs a confidence of 0.9 since decision 0149. Tried: training on cameras "
+    "of 0.3 to 3.2 m (decision 0154; forced at 0.2 m 0.815 -> 0.93), depth structure and confirmation (decisions 0159 and 0165; accepted "
+    "at 0.2 m 0.775 -> 0.88), a larger encoder (decision 0174; accepted at 0.8 m 0.915 -> 0.93, at 3.5 m 0.93 -> 0.90). A given height "
+    "gains nothing, because the estimate errs by 0.02 to 0.04 m. Next: low and high cameras in the calibration"
 )
 _OVER_BARE = (
     "Medians of runs differ by up to 10 %: full REST 0.97 to 1.13, retrieval REST 1.14 to 1.27, gRPC 1.15 to 1.29. A full "
@@ -160,17 +160,15 @@ WHY_MISSED: dict[str, Reason] = {
         "because the tails make the standard deviation large (see doubt.covariance_95_coverage). Next step: let the map build "
         "estimate the errors of the map",
     ),
-    "height.0.2.within_1_m": Reason(0.88, _HEIGHTS),
-    "height.0.2.given.within_1_m": Reason(0.87, _HEIGHTS),
-    "height.0.4.within_1_m": Reason(0.89, _HEIGHTS),
-    "height.0.4.given.within_1_m": Reason(0.89, _HEIGHTS),
-    "height.0.8.within_1_m": Reason(0.915, _HEIGHTS),
-    "height.0.8.given.within_1_m": Reason(0.92, _HEIGHTS),
-    "height.1.5.within_1_m": Reason(0.945, _HEIGHTS),
-    "height.1.5.given.within_1_m": Reason(0.95, _HEIGHTS),
-    "height.2.5.given.within_1_m": Reason(0.95, _HEIGHTS),
-    "height.3.5.within_1_m": Reason(0.93, _HEIGHTS),
-    "height.3.5.given.within_1_m": Reason(0.92, _HEIGHTS),
+    "height.0.2.within_1_m": Reason(0.865, _HEIGHTS),
+    "height.0.2.given.within_1_m": Reason(0.855, _HEIGHTS),
+    "height.0.4.within_1_m": Reason(0.895, _HEIGHTS),
+    "height.0.4.given.within_1_m": Reason(0.9, _HEIGHTS),
+    "height.0.8.within_1_m": Reason(0.93, _HEIGHTS),
+    "height.0.8.given.within_1_m": Reason(0.93, _HEIGHTS),
+    "height.2.5.given.within_1_m": Reason(0.965, _HEIGHTS),
+    "height.3.5.within_1_m": Reason(0.9, _HEIGHTS),
+    "height.3.5.given.within_1_m": Reason(0.895, _HEIGHTS),
     "real.kitti_0013.recall_at_1_10m": Reason(
         0.9583333,
         "One of 24 queries misses. With 24 queries the bar allows no miss. Retrieval alone finds 18 within 5 m, and "
