@@ -45,7 +45,7 @@ STOCK_CITIES = 26
 
 
 def stock_plans(cities: int) -> list[PackPlan]:
-    """Plan cities with modelled depth errors, the default of ``train``. A processor alone trains on them in an hour or two.
+    """Plan cities with modelled depth errors, the default of ``train``.
 
     Args:
         cities: number of cities.
@@ -133,9 +133,7 @@ def more_street_plans() -> list[PackPlan]:
 def _many_small(streets: _Streets) -> list[PackPlan]:
     """Plan the cities of one training, each kind after the other."""
     first, cities = streets.stock
-    stock = [
-        PackPlan(seed=TRAINING_SEEDS[first + k], places=1056, lidar=_LIDARS[k % len(_LIDARS)]) for k in range(cities)
-    ]
+    stock = [replace(plan, places=1056) for plan in stock_plans(first + cities)[first:]]
     low_and_high = [
         replace(plan, places=2 * _STREET_PLACES, queries_a_place=2) for plan in _surveyed(*streets.low_and_high)
     ]
