@@ -122,7 +122,7 @@ release-proto: .venv/.torch ## record the gRPC messages of a release; later ones
 lock: .venv/.uv ## renew the lock files; ARGS="--upgrade" takes newer packages
 	$(COMPILE) --extra dev --group oracle $(ARGS) --output-file locks/dev.txt
 	$(COMPILE) --extra mapping --constraint locks/dev.txt --output-file locks/mapping.txt
-	$(COMPILE) --extra server --extra store --constraint locks/dev.txt --output-file locks/service.txt
+	$(COMPILE) --extra server --extra store --extra otel --constraint locks/dev.txt --output-file locks/service.txt
 	$(COMPILE_BUILD) --constraint locks/dev.txt $(ARGS) --output-file locks/build.txt
 
 evaluate: .venv/.torch ## measure accuracy -> reports/accuracy.json

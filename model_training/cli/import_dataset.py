@@ -81,7 +81,8 @@ def command(
         bool | None,
         typer.Option(
             help="Correct the recording's poses step by step by scan matching. The whole trajectory stays in place. "
-            "Needs the extra odometry. Without the extra, the default keeps the recording's poses and says so.  "
+            "Needs gtsam and small_gicp, which the extra mapping installs. Without them, the default keeps the recording's "
+            "poses and says so.  "
             f"[default: on for {', '.join(sorted(ALIGNED_KINDS))} without --poses]"
         ),
     ] = None,

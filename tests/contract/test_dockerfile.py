@@ -99,6 +99,13 @@ def test_packages_are_installed_from_the_lock_by_hash() -> None:
     assert lock.count("--hash=sha256:") >= len(pinned)
 
 
+@pytest.mark.parametrize("package", ["obstore", "opentelemetry-exporter-otlp-proto-http"])
+def test_the_image_can_do_what_the_chart_offers(package: str) -> None:
+    """The chart has `maps.urls` and `network.collector`: maps in object storage, and traces."""
+    lock = (ROOT / "locks" / "service.txt").read_text()
+    assert re.search(rf"^{package}==", lock, flags=re.MULTILINE)
+
+
 def test_no_torch_and_no_build_tool_gets_in() -> None:
     lock = (ROOT / "locks" / "service.txt").read_text()
     assert not re.search(r"^(torch|embreex|tensorboard|nvidia|pytest|setuptools|wheel)\b", lock, flags=re.MULTILINE)
