@@ -104,8 +104,8 @@ WHY_MISSED: dict[str, Reason] = {
         0.985,
         "17 of 3,000 queries have a forced error above 1 m, 5 of these above 5 m. 27 answers are refused, 17 of them right. 11 accepted "
         "answers are between 0.5 and 1 m off, and 7 between 1 and 3 m. None is farther off. Tried last: comparison with poses further "
-        "along the street (decision 0165), a larger encoder (decision 0174; R@1 0.988 -> 0.997, but the same accepted share). Next step: use "
-        "brightness already when few points select the candidates",
+        "along the street (decision 0165), a larger encoder (decision 0174; R@1 0.988 -> 0.997, but the same accepted share). Next step: "
+        "use brightness already when few points select the candidates",
     ),
     "full.unseen.stereo.within_1_m": Reason(
         0.9516667,
