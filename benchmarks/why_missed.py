@@ -247,9 +247,9 @@ WHY_MISSED["docs.code_blocks_run"] = Reason(
 )
 WHY_MISSED["sequence.landmark.within_1_m"] = Reason(
     0.8194444444444444,
-    "59 of 72 answers are accepted and within 1 m (53 with the encoder before, 35 before decision 0169). None of the 137 sequences "
+    "59 of 72 answers are accepted and within 1 m (59 with the encoder before, 35 before decision 0169). None of the 137 sequences "
     "without a landmark is accepted and wrong. The default needs a confidence of 0.9, and the repeating street is a family of the "
-    "calibration: half of its single answers are wrong, so equal blocks lower the confidence. Tried: encoders (decisions 0154 and 0171), "
+    "calibration: half of its single answers are wrong, so equal blocks lower the confidence. Tried: encoders (0154, 0171 and 0174), "
     "depth structure (0159), frames that confirm each other (0169). Next: a feature that tells a landmark from a repeated block",
 )
 WHY_MISSED["rigs.worst_ece"] = Reason(
