@@ -65,7 +65,7 @@ def test_import_says_what_came_in_and_what_did_not(scans, tmp_path, capsys):
 def test_help_says_which_options_need_an_extra(capsys):
     assert run("import", "--help") == 0
     told = " ".join(capsys.readouterr().out.split())
-    assert "Needs the extra odometry. Without the extra, the default keeps the recording's poses and says so." in told
+    assert "Needs gtsam and small_gicp, which the extra mapping installs. Without them, the default keeps" in told
     assert "The command ignores the recording's own poses. Needs the extra odometry." in told
 
 
