@@ -233,18 +233,14 @@ WHY_MISSED: dict[str, Reason] = {
         "fields (8 to 7). A sixth file would merge two tasks, or take the camera checks out of the schema that the client uses too",
     ),
     "request.files_in_core": Reason(
-        55,
+        56,
         "The count includes every file whose functions one request calls. 12 decode, level and fuse images, 6 retrieve, 6 register, 9 "
-        "score, 4 decide, 4 build the answer, 5 read the map, 2 are geometry, 7 belong to the engine. Tried: packages by stage with small "
-        "files joined (56 to 53; depth structure and confirmation are two more). The others have readers of their own or several users. 20 "
-        "files would hold several subjects each",
+        "score, 4 decide, 5 compare frames and build the answer, 5 read the map, 2 are geometry, 7 belong to the engine. Tried: packages "
+        "by stage with small files joined (56 to 53; depth structure, confirmation and agreement are three more). The others have readers "
+        "of their own or several users. 20 files would hold several subjects each",
     ),
 }
 
-WHY_MISSED["docs.code_blocks_run"] = Reason(
-    0.95,
-    "Two commands of docs/robot.md named no service, so the run started none for them. They name it since this run",
-)
 WHY_MISSED["sequence.landmark.within_1_m"] = Reason(
     0.8194444444444444,
     "59 of 72 answers are accepted and within 1 m (59 with the encoder before, 35 before decision 0169). None of the 137 sequences "
