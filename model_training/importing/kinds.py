@@ -3,13 +3,16 @@
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 from model_training.importing.extrinsics import Extrinsics
 from model_training.importing.recording import Recording
 from model_training.importing.spinning import KITTI_VERTICAL_DEG
 from service.errors import DatasetError
 from service.geometry.camera import PinholeCamera
+
+if TYPE_CHECKING:
+    from model_training.importing.kitti_sequence import KittiSequence
 
 DepthFrom = Literal["recorded", "stored", "sgbm", "lidar"]
 
@@ -104,20 +107,22 @@ def _refuse_what_does_not_apply(kind: str, settings: OpenSettings) -> None:
 def _kitti_raw(source: Path, settings: OpenSettings) -> Recording:
     from model_training.importing.kitti_raw import open_kitti_raw
 
-    return open_kitti_raw(source, depth=_kitti_depth(settings.depth), vertical_deg=settings.kitti_vertical_deg)
+    depth = _kitti_depth(settings.depth)
+    return _aligned(open_kitti_raw(source, depth=depth, vertical_deg=settings.kitti_vertical_deg), settings)
 
 
 def _kitti_odometry(source: Path, settings: OpenSettings) -> Recording:
     from model_training.importing.kitti_odometry import open_kitti_odometry
 
-    return open_kitti_odometry(source, depth=_kitti_depth(settings.depth), vertical_deg=settings.kitti_vertical_deg)
+    depth = _kitti_depth(settings.depth)
+    return _aligned(open_kitti_odometry(source, depth=depth, vertical_deg=settings.kitti_vertical_deg), settings)
 
 
 def _kitti_360(source: Path, settings: OpenSettings) -> Recording:
     from model_training.importing.kitti_360 import open_kitti_360
 
     # The layout has no stored depth, so the default is stereo-matched depth.
-    return open_kitti_360(source, depth="none" if settings.depth == "lidar" else "sgbm")
+    return _aligned(open_kitti_360(source, depth="none" if settings.depth == "lidar" else "sgbm"), settings)
 
 
 def _clouds(source: Path, settings: OpenSettings) -> Recording:
@@ -158,6 +163,11 @@ def _rosbag(source: Path, settings: OpenSettings) -> Recording:
         want_depth=settings.depth == "recorded",
     )
     return RosBag(source, bag)
+
+
+def _aligned(drive: "KittiSequence", settings: OpenSettings) -> Recording:
+    """Return a drive with aligned rows if its pairs will be matched."""
+    return drive.with_aligned_rows() if drive.depth == "sgbm" and settings.pictures else drive
 
 
 def _kitti_depth(depth: DepthFrom) -> Literal["none", "stored", "sgbm"]:

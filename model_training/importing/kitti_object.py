@@ -28,7 +28,7 @@ from model_training.datasets.dataset import (
 from model_training.datasets.whole_folder import whole_or_not_at_all
 from model_training.importing.kitti_calibration import KittiCalibration, read_calibration
 from model_training.importing.kitti_files import copy_scan, damaged, read_rgb, read_stored_depth
-from model_training.importing.stereo import StereoMatching, depth_from_stereo
+from model_training.importing.stereo import RECORDED, depth_from_stereo
 from service.errors import DatasetError
 from service.geometry.rigid import Transform, inverse, transform_from
 
@@ -167,7 +167,7 @@ class _Importer:
         source: dict[str, Any] = {"kind": "kitti-object", "depth": self._depth, "places": self._places}
         source["queries"] = {name: queries.names for name, queries in self._sets.items() if queries.names}
         if self._depth == "sgbm":
-            source["matching"] = StereoMatching().description()
+            source["matching"] = RECORDED.description()
         return source
 
     def _add_query(self, name: str, right: Path, stored: Path, T_map_lidar: Transform | None) -> None:

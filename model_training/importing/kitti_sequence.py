@@ -1,7 +1,7 @@
 """Common part of KITTI's raw, odometry and 360 layouts: numbered frames of a rig with one calibration."""
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -13,9 +13,10 @@ from model_training.datasets.dataset import LidarSensor
 from model_training.importing.kitti_calibration import KittiCalibration
 from model_training.importing.kitti_files import read_rgb, read_stored_depth
 from model_training.importing.recording import Event, Notes, RecordedPicture, RecordedScan, Unusable
+from model_training.importing.row_alignment import PAIRS, Rgb, RowAlignment, row_alignment
 from model_training.importing.scan_file import read_scan
 from model_training.importing.spinning import raised, times_by_azimuth
-from model_training.importing.stereo import StereoMatching, depth_from_stereo
+from model_training.importing.stereo import RECORDED, depth_from_stereo
 from model_training.importing.trajectory import Trajectory
 from service.errors import DatasetError
 from service.geometry.camera import PinholeCamera
@@ -69,6 +70,7 @@ class KittiSequence:
         turn_s: time of one turn of the LiDAR, seconds: the times of points follow from their azimuths. None if the scans are
             already compensated.
         vertical_deg: rotation upwards of every point, degrees.
+        rows: how far the rows of a stereo pair are apart; None if it is not known.
     """
 
     kind: str
@@ -81,6 +83,14 @@ class KittiSequence:
     lidar: LidarSensor = HDL64
     turn_s: float | None = None
     vertical_deg: float = 0.0
+    rows: RowAlignment | None = None
+
+    def with_aligned_rows(self) -> "KittiSequence":
+        """Return the drive with the alignment of its rows, measured on some of its pairs; pairs that cannot be read are omitted."""
+        paired = [frame for frame in self.frames if frame.left is not None and frame.right is not None]
+        chosen = {int(k) for k in np.linspace(0, len(paired) - 1, PAIRS).round()} if paired else set()
+        pairs = [pair for k in sorted(chosen) if (pair := _pair(paired[k])) is not None]
+        return replace(self, rows=row_alignment(pairs, self._camera(pairs[0][0])) if pairs else None)
 
     @property
     def notes(self) -> Notes:
@@ -97,7 +107,7 @@ class KittiSequence:
         if self.turn_s is not None:
             source["turn_s"] = self.turn_s
         if self.depth == "sgbm":
-            source["matching"] = StereoMatching().description()
+            source["matching"] = RECORDED.description()
         times = (
             "scans are assumed to be corrected for the vehicle's motion"
             if self.turn_s is None
@@ -105,6 +115,13 @@ class KittiSequence:
         )
         turned = f"; points turned up by {self.vertical_deg:g} degrees" if self.vertical_deg else ""
         counted = f"{len(self.frames)} moments: {scans} scans, {left} left and {right} right images"
+        lines = [counted, times + turned]
+        if self.rows is not None:
+            source["row_alignment"] = asdict(self.rows)
+            lines.append(
+                f"the right camera is turned by {np.rad2deg(self.rows.pitch_rad):.3f} degrees of pitch and "
+                f"{np.rad2deg(self.rows.roll_rad):.3f} of roll ({self.rows.matches} matched features): its rows are aligned"
+            )
         needed = {"stored": "stored", "sgbm": "right"}.get(self.depth)
         lacking = left > 0 and needed and not any(frame.left and getattr(frame, needed) for frame in self.frames)
         what = "stored depth" if needed == "stored" else "a right image"
@@ -112,7 +129,7 @@ class KittiSequence:
             f"no image has {what}, so no image becomes a query: {self._depth_choices()}; --no-pictures imports no "
             "images"
         )
-        return Notes((counted, times + turned), source, (hint,) if lacking else ())
+        return Notes(tuple(lines), source, (hint,) if lacking else ())
 
     def _depth_choices(self) -> str:
         """Which values of ``--depth`` serve this recording, and why the others do not."""
@@ -171,14 +188,11 @@ class KittiSequence:
         name, calibration = f"image {frame.name}", self.calibration
         try:
             rgb = read_rgb(left)
-            camera = PinholeCamera(
-                rgb.shape[1], rgb.shape[0], calibration.fx, calibration.fy, calibration.cx, calibration.cy
-            )
             picture = RecordedPicture(
                 name,
                 frame.stamp_s,
                 rgb,
-                camera,
+                self._camera(rgb),
                 inverse(calibration.T_camera_lidar),
                 depth_scale_m=STORED_SCALE_M,
                 file=left,
@@ -195,14 +209,31 @@ class KittiSequence:
         except DatasetError as error:
             return Unusable("image", name, _without_names(error.message, (left, frame.right, frame.stored)))
 
-    def _matched(self, picture: RecordedPicture, right: NDArray[np.uint8]) -> RecordedPicture | Unusable:
+    def _camera(self, rgb: Rgb) -> PinholeCamera:
+        of = self.calibration
+        return PinholeCamera(rgb.shape[1], rgb.shape[0], of.fx, of.fy, of.cx, of.cy)
+
+    def _matched(self, picture: RecordedPicture, right: Rgb) -> RecordedPicture | Unusable:
         if right.shape != picture.rgb.shape:
             return Unusable("image", picture.name, "its right image has another size")
         assert self.calibration.focal_baseline_px_m is not None  # noqa: S101  # ``events`` checked this
+        if self.rows is not None:
+            right = self.rows.aligned(right, picture.camera)
         depth_m: Float32[NDArray[np.float32], "H W"] = depth_from_stereo(
             picture.rgb, right, focal_baseline_px_m=self.calibration.focal_baseline_px_m
         )
         return replace(picture, depth=depth_m, baseline_m=self.calibration.baseline_m)
+
+
+def _pair(frame: KittiFrame) -> tuple[Rgb, Rgb] | None:
+    """Read both images of a frame; None if one is missing or broken, or if their sizes differ."""
+    if frame.left is None or frame.right is None:
+        return None
+    try:
+        left, right = read_rgb(frame.left), read_rgb(frame.right)
+    except DatasetError:  # the event of this frame reports it
+        return None
+    return (left, right) if left.shape == right.shape else None
 
 
 def _without_names(message: str, files: tuple[Path | None, ...]) -> str:

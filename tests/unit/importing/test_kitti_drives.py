@@ -156,6 +156,43 @@ def test_matched_depth_is_that_of_the_wall(drive):
     assert abs(np.median(depth[depth > 0]) - 5.0) < 0.02
 
 
+def lower_the_right_images(drive, rows):
+    """Move what the right images show down by some rows, as a turned right camera does."""
+    for folder in ("image_3", "image_03/data"):
+        for path in (drive / folder).glob("*.png"):
+            picture = cv2.imread(str(path))
+            assert picture is not None
+            cv2.imwrite(str(path), np.roll(picture, rows, axis=0))
+
+
+def test_the_rows_of_the_pairs_are_aligned(drive, tmp_path):
+    """One row at a focal length of 200 px is a pitch of 1 / 200 rad = 0.286 degrees."""
+    lower_the_right_images(drive, 1)
+    recording = opened(drive, "sgbm")
+    assert any("0.28" in text and "degrees of pitch" in text for text in recording.notes.lines)
+    take(recording, recording.trajectory(), tmp_path / "taken", TakeSettings())
+    dataset = Dataset(tmp_path / "taken")
+    assert dataset.description.source["row_alignment"]["pitch_rad"] == pytest.approx(1 / 200, rel=0.02)
+    depth = events_of(drive, RecordedPicture, "sgbm")[0].depth[5:-5, 140:]
+    assert (np.abs(depth - 5.0) < 0.05).mean() > 0.9
+
+
+def test_pairs_that_cannot_be_read_do_not_prevent_the_alignment(drive):
+    lower_the_right_images(drive, 1)
+    for path in [*drive.glob("image_2/*1.png"), *drive.glob("image_02/data/*1.png")]:
+        path.write_bytes(b"no image")
+    source = opened(drive, "sgbm").notes.source
+    assert source["row_alignment"]["pitch_rad"] == pytest.approx(1 / 200, rel=0.02)
+
+
+def test_rows_are_measured_only_for_matching(drive):
+    kind = "kitti-raw" if (drive / "velodyne_points").is_dir() else "kitti-odometry"
+    without_pictures = open_recording(kind, drive, OpenSettings(depth="sgbm", pictures=False))
+    for recording in (without_pictures, opened(drive, "stored")):
+        assert "row_alignment" not in recording.notes.source
+    assert "row_alignment" in opened(drive, "sgbm").notes.source
+
+
 @pytest.mark.parametrize(("depth", "baseline_m"), [("sgbm", BASELINE_M), ("stored", None)])
 def test_only_matched_depth_has_a_baseline(drive, depth, baseline_m, tmp_path):
     recording = opened(drive, depth)
