@@ -260,7 +260,8 @@ WHY_MISSED["sequence.landmark.within_1_m"] = Reason(
 WHY_MISSED["rigs.worst_ece"] = Reason(
     0.17222222222222222,
     "The worst family are the sparse rings of a spinning LiDAR. No fit contains them, and the service refuses their answers as out of "
-    "range. Of these answers 0.37 are right (0.26 with the encoder before). Among the fitted families the worst is the D435 (rigs.worst_fitted_ece). See rigs.rings.ece and rigs.d435.ece",
+    "range. Of these answers 0.37 are right (0.26 with the encoder before). Among the fitted families the worst is the D435 "
+    "(rigs.worst_fitted_ece). See rigs.rings.ece and rigs.d435.ece",
 )
 WHY_MISSED["rigs.worst_within_1_m"] = Reason(
     0.196,
@@ -321,8 +322,9 @@ _RIGS = {
     "within_1_m": (
         "Most of the wrong answers are in another place. Cameras of small robots see little: depth ends at 5 to 12 m, or the baseline is "
         "too small for the depth beyond 10 m. Tried: training on random rigs (decision 0154; ZED 2 0.58 -> 0.69, D435 0.46 -> 0.62, robot "
-        "0.79 -> 0.83), a larger encoder (decision 0174; car 0.92 -> 0.95, ZED 2 0.71, D435 0.68, robot 0.84), more starts, more states to the end, 48 hypotheses, weights of the support. Four cameras have 0.998, and five "
-        "frames find nearly all places of the cars and the robot"
+        "0.79 -> 0.83), a larger encoder (decision 0174; car 0.92 -> 0.95, ZED 2 0.71, D435 0.68, robot 0.84), more starts, more states to "
+        "the end, 48 hypotheses, weights of the support. Four cameras have 0.998, and five frames find nearly all places of the cars and "
+        "the robot"
     ),
     "right_but_refused": (
         "A LOCALIZED answer needs a confidence of 0.9, with every second query from outside the map. A rate of 0.02 accepts most of these "
@@ -340,9 +342,9 @@ _RIGS = {
     "covariance_95_coverage": (
         "The interval has two sides. Half of the errors are smaller than the covariance says, and 6 to 14 % of the answers are outside: a "
         "second minimum within 1 m. Monocular depth has a scale error in its height. Four cameras have mounting errors of 0.2 degrees. "
-        "Decisions 0151 and 0157 raised the car from 0.27 to 0.88, the lorry from 0.32 to 0.84 and ZED 2 from 0.31 to 0.83. With the encoder of "
-        "decision 0174 they are 0.89, 0.81 and 0.87. Tried: errors "
-        "of the map (decision 0160): they cover the tails and make the rest too large. Next: a covariance that spans both minima"
+        "Decisions 0151 and 0157 raised the car from 0.27 to 0.88, the lorry from 0.32 to 0.84 and ZED 2 from 0.31 to 0.83. With the "
+        "encoder of decision 0174 they are 0.89, 0.81 and 0.87. Tried: errors of the map (decision 0160): they cover the tails and make "
+        "the rest too large. Next: a covariance that spans both minima"
     ),
     "sigma_coverage_gap": (
         "The axis stands beside the figure. Along the street the covariance is too large for most answers, because it covers the second "
