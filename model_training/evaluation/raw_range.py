@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from model_training.datasets.dataset import Dataset
 from model_training.mapping.settings import BuildSettings
-from model_training.mapping.survey import view_ranges
+from model_training.mapping.survey import thinned, view_ranges
 from service.errors import NoDepthError
 from service.imaging.query_view import query_views
 from service.imaging.view_grid import ViewGrid
@@ -99,24 +99,23 @@ def raw_best_views(
         expected_lidar_height_m=bundle.manifest.parameters["expected_lidar_height_m"],
         remove_weather=bool(bundle.manifest.parameters["weather_removed"]),
     )
-    waiting: list[Ranges] = []
+    fans = view_ranges(dataset, settings, bundle.grid, bundle.rows_seen)
+    # A map may have further places between scans. They are rendered from two scans, so this baseline has no view of them.
+    total = len(thinned(dataset.survey_poses(), settings.spacing_m))
     first = 0
-    total = bundle.manifest.counts.places
-    for place, fan in enumerate(view_ranges(dataset, settings, bundle.grid, bundle.rows_seen), 1):
-        waiting.append(fan)
-        report("raw range images", place, total)
-        if len(waiting) * len(fan) >= CHUNK or place == total:
-            views = np.concatenate(waiting)
-            for name, flat in similarities(asked, views).items():
-                each_turn = flat.reshape(-1, queries.shape[1], len(views))
-                for setting, similarity in ((name, each_turn.max(axis=1)), (name + STRAIGHT, each_turn[:, straight])):
-                    at = similarity.argmax(axis=1)
-                    top = similarity[np.arange(len(at)), at]
-                    better = top > score[setting][usable]
-                    rows = np.flatnonzero(usable)[better]
-                    score[setting][rows] = top[better]
-                    best[setting][rows] = first + at[better] // len(fan)
-            first, waiting = place, []
+    while waiting := list(islice(fans, max(1, CHUNK // settings.headings))):
+        views = np.concatenate(waiting)
+        for name, flat in similarities(asked, views).items():
+            each_turn = flat.reshape(-1, queries.shape[1], len(views))
+            for setting, similarity in ((name, each_turn.max(axis=1)), (name + STRAIGHT, each_turn[:, straight])):
+                at = similarity.argmax(axis=1)
+                top = similarity[np.arange(len(at)), at]
+                better = top > score[setting][usable]
+                rows = np.flatnonzero(usable)[better]
+                score[setting][rows] = top[better]
+                best[setting][rows] = first + at[better] // settings.headings
+        first += len(waiting)
+        report("raw range images", first, total)
     return best
 
 

@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -88,3 +90,12 @@ def test_the_best_place_is_that_of_the_most_similar_view_of_all(best, small_map,
             expected = compared.argmax(axis=1) // 6
             np.testing.assert_array_equal(best[name], expected)
             np.testing.assert_array_equal(piece_by_piece[name], expected)
+
+
+def test_a_map_with_places_between_scans_has_the_same_answers(best, small_map, small_dataset):
+    """The views of a map are compared to the end, although further places follow those at scans."""
+    bundle = MapBundle.open(small_map)
+    counts = bundle.manifest.counts.model_copy(update={"places": bundle.manifest.counts.places + 10})
+    longer = replace(bundle, manifest=bundle.manifest.model_copy(update={"counts": counts}))
+    for setting, numbers in raw_best_views(longer, small_dataset, ["drive1_precise"]).items():
+        np.testing.assert_array_equal(numbers, best[setting])
