@@ -39,8 +39,13 @@ def drives_below(root: Path) -> list[Drive]:
         root: folder to search.
     """
     found = dict[str, Drive]()
+
+    def has_pair(folder: Path, *right: str) -> bool:
+        """Return whether the right camera of a colour or grey pair is there, as the importers need it."""
+        return any((folder / name).is_dir() for name in right)
+
     for folder in sorted(root.rglob("sequences/[0-9][0-9]")):
-        if (folder / "velodyne").is_dir() and (folder / "image_3").is_dir():
+        if (folder / "velodyne").is_dir() and has_pair(folder, "image_3", "image_1"):
             found.setdefault(folder.name, Drive(folder.name, "kitti-odometry", folder))
     for folder in sorted(root.rglob("data_3d_raw/*_sync")):
         beside = folder.parent.parent
@@ -50,7 +55,7 @@ def drives_below(root: Path) -> list[Drive]:
             found.setdefault(name, Drive(name, "kitti-360", folder))
     for folder in sorted(root.rglob("*_sync")):
         scans = folder / "velodyne_points" / "data"
-        if not scans.is_dir() or not (folder / "image_03").is_dir() or not (folder / "oxts").is_dir():
+        if not scans.is_dir() or not has_pair(folder, "image_03", "image_01") or not (folder / "oxts").is_dir():
             continue
         packed = any(scans.glob("*.xz"))
         name = folder.name.removesuffix("_sync")

@@ -7,23 +7,18 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.real.streets import QUERIES, answer_rows, imported, sequence_rows, status_rows
+from benchmarks.real.streets import QUERIES, answer_rows, imported, prior_rows, sequence_rows
 from benchmarks.report import Report
 from model_training.datasets.dataset import Dataset, Transforms
-from model_training.evaluation.failures import position_errors
 from model_training.evaluation.predict import Predictions, predict
 from model_training.mapping.build import build_map
 from model_training.mapping.settings import BuildSettings
 from model_training.stock import ENCODER
-from service.geometry.rigid import Transform
 from service.localization.localizer import Localizer
 from service.maps.reader import MapBundle
-from service.retrieval.prior import Prior
 from service.retrieval.query import Query
 
 DRIVE = "kitti_0005"
-#: Standard deviation of the prior's error, metres.
-PRIOR_M = 3.0
 #: Intervals of the scans of sparse surveys. The drive has one scan every 2.7 m.
 SPARSE = (2, 3)
 
@@ -64,16 +59,6 @@ def grey(query: Query) -> Query:
     return replace(query, rgb=np.repeat(brightness[..., None], 3, axis=2))
 
 
-def prior_at(T_map_camera: Transform, rng: np.random.Generator) -> Prior:
-    """Return a prior whose error agrees with its standard deviation.
-
-    Args:
-        T_map_camera: true pose of the camera (4, 4).
-        rng: source of the error.
-    """
-    return Prior(position_m=T_map_camera[:2, 3] + rng.normal(0, PRIOR_M, 2), position_std_m=PRIOR_M)
-
-
 def variant_rows(report: Report, data: Path, work: Path) -> None:
     """Measure the drive in each condition, at default settings.
 
@@ -88,10 +73,7 @@ def variant_rows(report: Report, data: Path, work: Path) -> None:
         return
     whole = _localizer(dataset, work / "variant_map")
     answer_rows(report, f"real.{DRIVE}.grey", predict(whole, dataset, QUERIES, seen_by=grey), bars=False)
-    with_prior = predict(whole, dataset, QUERIES, prior_of=prior_at)
-    status_rows(
-        report, f"real.{DRIVE}.prior_3_m", position_errors(with_prior), with_prior.localized, bars=(None, None, None)
-    )
+    prior_rows(report, DRIVE, dataset, whole)
     sequence_rows(report, DRIVE, dataset, whole, bars=False)
     for each in SPARSE:
         found = []

@@ -131,7 +131,7 @@ FAMILIES = (
     Family("every_10_m", CameraPlan(width=640, height=480, horizontal_deg=90.0), 1.5, ("stereo",), "os1_128", 10.0, 1.8, _CAR),
     # The camera of the simulator, with a 16-beam survey.
     Family("vlp_16", CameraPlan(width=848, height=480, horizontal_deg=110.0), 1.5, ("stereo",), "vlp_16", 1.0, 1.8, _SLOW),
-    # An iPhone with LiDAR: 256 x 192 depth pixels, held upright, 5 m.
+    # An iPhone with LiDAR, held upright, 5 m. Its 256 x 192 depth pixels are simulated at the size of the colour image.
     Family("iphone", CameraPlan(width=480, height=640, horizontal_deg=50.0), 1.4, ("precise",), "os1_64", 1.0, 1.6, _SLOW,
            depth=DepthParameters(focal_baseline_px_m=200.0, noise_px=0.1, step_px=0.0, max_range_m=5.0), fitted=False),
     # A survey with a LiDAR whose scans do not repeat and that hardly looks down.

@@ -93,6 +93,7 @@ LIDARS = {
         LidarModel("vlp_16", 16, 1024, 15.0, -15.0, 0.03),
         LidarModel("hdl_32", 32, 1024, 10.67, -30.67),
         _with_beams("hdl_64", _HDL_64),
+        LidarModel("os0_128", 128, 1024, 45.0, -45.0),
         LidarModel("os1_64", 64, 1024, 16.6, -16.6),
         LidarModel("os1_128", 128, 1024, 22.5, -22.5),
         _with_beams("pandar_64", _PANDAR_64),

@@ -160,6 +160,13 @@ def test_drives_are_found_wherever_they_lie(tmp_path):
     assert not any("2011_09_30_drive_0027" in line for line in words)
 
 
+def test_drives_with_a_grey_pair_only_are_found(tmp_path):
+    drive(tmp_path, "gray/sequences/07/velodyne", "gray/sequences/07/image_1")
+    raw = "raw/2011_09_30/2011_09_30_drive_0028_sync"
+    drive(tmp_path, f"{raw}/velodyne_points/data", f"{raw}/image_01", f"{raw}/oxts")
+    assert [each.name for each in drives_below(tmp_path)] == ["07", "2011_09_30_drive_0028"]
+
+
 def test_a_packed_drive_is_recognised(tmp_path):
     raw = tmp_path / "kitti_0005/2011_09_26/2011_09_26_drive_0005_sync"
     drive(raw, "velodyne_points/data", "image_03", "oxts")

@@ -12,8 +12,8 @@ from benchmarks.real.confidence import (
     with_correction,
 )
 from benchmarks.real.peers import pooled_rows
-from benchmarks.real.streets import answer_rows, status_rows
-from benchmarks.real.variants import PRIOR_M, EveryScan, grey, prior_at
+from benchmarks.real.streets import PRIOR_M, answer_rows, prior_at, status_rows
+from benchmarks.real.variants import EveryScan, grey
 from benchmarks.report import Report
 from model_training.datasets.dataset import Dataset
 from service.geometry.camera import PinholeCamera

@@ -67,6 +67,7 @@ def test_a_wall_beyond_the_limit_is_not_seen(wall):
         ("paper_32", 32),
         ("hdl_32", 32),
         ("hdl_64", 64),
+        ("os0_128", 128),
         ("os1_64", 64),
         ("os1_128", 128),
         ("pandar_64", 64),
