@@ -78,6 +78,8 @@ export interface Answer {
   /** extrapolated: a confidence feature lies outside the range of the calibration data, so the confidence may be wrong. */
   calibration: 'in_range' | 'extrapolated' | null;
   extrapolated: Record<string, number>;
+  /** Least confidence of a LOCALIZED answer, and an upper bound of the share of out-of-map queries that reach it. */
+  threshold: { confidence: number; false_accept_rate: number } | null;
   map: MapVersion;
   timings_ms: { decode: number; fuse: number; encode: number; search: number; register: number; total: number };
 }

@@ -117,7 +117,7 @@ export class AnswerPanel {
       rows.push(['σ heading', degrees(answer.spread.heading_std_deg)]);
       rows.push(['weight of hypotheses', percent(answer.spread.hypotheses_weight)]);
     }
-    rows.push(...extrapolatedRow(answer), ...heightRow(answer));
+    rows.push(...thresholdRow(answer), ...extrapolatedRow(answer), ...heightRow(answer));
     rows.push(['map', `${answer.map.name} ${answer.map.version.slice(0, 8)}`]);
     return element('section', {}, element('h2', {}, 'Possible positions'), facts(rows));
   }
@@ -133,7 +133,7 @@ export class AnswerPanel {
       rows.push(['σ on the ground', `${metres(ellipse.major)} × ${metres(ellipse.minor)}`]);
       rows.push(['σ heading', degrees((180 / Math.PI) * Math.sqrt(covariance[35] ?? 0))]);
     }
-    rows.push(...extrapolatedRow(answer), ...heightRow(answer));
+    rows.push(...thresholdRow(answer), ...extrapolatedRow(answer), ...heightRow(answer));
     rows.push(['map', `${answer.map.name} ${answer.map.version.slice(0, 8)}`]);
     return element('section', {}, element('h2', {}, 'Pose'), facts(rows));
   }
@@ -198,6 +198,13 @@ export class AnswerPanel {
 function extrapolatedRow({ extrapolated }: Answer): [string, string][] {
   const features = Object.entries(extrapolated).map(([name, size]) => `${name} ${size > 0 ? '+' : '−'}${Math.abs(size).toFixed(1)} σ`);
   return features.length === 0 ? [] : [['confidence is extrapolated', features.join(', ')]];
+}
+
+/** The same words as in docs/confidence.md and `serve --help`. */
+function thresholdRow({ threshold }: Answer): [string, string][] {
+  if (threshold === null) return [];
+  const share = `${Number((100 * threshold.false_accept_rate).toPrecision(2))} %`;
+  return [['LOCALIZED from', `confidence ${threshold.confidence.toFixed(2)}; at most ${share} of out-of-map queries reach it`]];
 }
 
 function heightRow({ camera_height }: Answer): [string, string][] {
