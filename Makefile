@@ -35,7 +35,7 @@ export ORT_DISABLE_TELEMETRY := 1
 .DEFAULT_GOAL := help
 .NOTPARALLEL:
 .DELETE_ON_ERROR:
-.PHONY: help demo demo-real test test-service check check-native sanitize console check-console test-console format generate release-proto lock evaluate evaluate-real bench-kitti choices paper bench-training bench-serving bench-scale fuzz chaos sbom audit reports docs docs-blocks house pictures encoder paper-encoder calibration install-demo install-test clean
+.PHONY: help demo demo-real test test-service test-ray check check-native sanitize console check-console test-console format generate release-proto lock evaluate evaluate-real bench-kitti choices paper bench-training bench-serving bench-scale fuzz chaos sbom audit reports docs docs-blocks house pictures encoder paper-encoder calibration install-demo install-test clean
 
 help: ## list all targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "make %-16s %s\n", $$1, $$2}' Makefile
@@ -61,6 +61,10 @@ test-service: .venv/.dev ## the tests of the service, without torch and the simu
 	$(BIN)/python -m pytest $(TEST_PROCESSES) $(addprefix --ignore ,$(SIMULATING)) tests/unit/test_*.py \
 		$(addprefix tests/unit/,bridge client confidence console contract doctor geometry grpc http imaging localization maps \
 		registration retrieval runtime scoring) $(ARGS)
+
+test-ray: .venv/.torch ## builds of tiled maps on a Ray cluster whose workers, node and driver are killed; installs the extra `ray`
+	$(INSTALL) 'ray>=2.50,<3'
+	$(BIN)/python -m pytest tests/unit/mapping/test_ray_cluster.py tests/unit/mapping/test_build_tiled.py -k ray $(ARGS)
 
 check: .venv/.torch ## lint, types, layers, and whether the contracts equal the code
 	$(BIN)/ruff check

@@ -1,0 +1,131 @@
+"""Builds on a Ray cluster of two nodes, whose workers, node and driver are killed. Needs the extra ``ray`` (``make test-ray``)."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from model_training.mapping.work import work_folder
+
+ray = pytest.importorskip("ray", reason="needs the extra `ray`")
+
+BUILD = "from service.cli.start import main; main()"
+#: Ray names the process of a running task so.
+TASK = "ray::_in_task"
+TILE_M = 50
+
+
+def files_of(folder: Path) -> dict[str, bytes]:
+    """Return every file of a map; manifests without the time of the build."""
+    found = {str(p.relative_to(folder)): p.read_bytes() for p in sorted(folder.rglob("*")) if p.is_file()}
+    for name in [name for name in found if name.endswith("manifest.json")]:
+        manifest = json.loads(found[name])
+        del manifest["made_at"]
+        found[name] = json.dumps(manifest).encode()
+    return found
+
+
+def running_tasks() -> list[int]:
+    """Return the process ids of the tasks that run now."""
+    found = []
+    for folder in Path("/proc").glob("[0-9]*"):
+        try:
+            if (folder / "cmdline").read_bytes().startswith(TASK.encode()):
+                found.append(int(folder.name))
+        except OSError:  # the process has ended
+            continue
+    return found
+
+
+def until(is_true: Callable[[], Any], seconds: float = 120.0) -> Any:
+    end = time.monotonic() + seconds
+    while time.monotonic() < end:
+        if found := is_true():
+            return found
+        time.sleep(0.02)
+    raise AssertionError("it did not happen in time")
+
+
+@pytest.fixture
+def cluster(monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
+    """A head without cores, and two nodes with one core each. Each has processes of its own."""
+    from ray.cluster_utils import Cluster
+
+    monkeypatch.setenv("RAY_USAGE_STATS_ENABLED", "0")
+    made = Cluster(initialize_head=True, head_node_args={"num_cpus": 0, "include_dashboard": False})
+    try:
+        made.nodes = [made.add_node(num_cpus=1) for _ in range(2)]
+        yield made
+    finally:
+        made.shutdown()
+
+
+@pytest.fixture
+def start(cluster: Any, small_dataset: Any, encoder_file: Path, tmp_path: Path) -> Iterator[Callable[..., Any]]:
+    """Return what starts a build as a user does, in a process of its own."""
+    started: list[subprocess.Popen[str]] = []
+
+    def build(name: str, engine: str = "ray") -> "subprocess.Popen[str]":
+        command = [sys.executable, "-c", BUILD, "build-map", str(small_dataset.folder), "--out", str(tmp_path / name)]
+        command += ["--encoder", str(encoder_file), "--name", "tiled", "--headings", "6", "--spacing", "5", "--voxel", "0.6"]
+        command += ["--tile-m", str(TILE_M), "--engine", engine, "--workers", "2"]
+        process = subprocess.Popen(
+            command,
+            env=os.environ | {"RAY_ADDRESS": cluster.address},
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+        started.append(process)
+        return process
+
+    yield build
+    for process in started:
+        process.kill()
+        process.communicate()
+
+
+@pytest.fixture
+def undisturbed(start: Callable[..., Any], tmp_path: Path) -> dict[str, bytes]:
+    """Return the files of a build in local processes."""
+    process = start("local", "local")
+    _, said = process.communicate(timeout=300)
+    assert process.returncode == 0, said
+    return files_of(tmp_path / "local")
+
+
+def test_a_build_survives_a_killed_worker_and_a_lost_node(
+    cluster: Any, start: Callable[..., Any], undisturbed: dict[str, bytes], tmp_path: Path
+) -> None:
+    process = start("m")
+    killed = until(running_tasks)[0]
+    os.kill(killed, signal.SIGKILL)
+    until(lambda: [pid for pid in running_tasks() if pid != killed])
+    cluster.remove_node(cluster.nodes[0], allow_graceful=False)
+    _, said = process.communicate(timeout=300)
+    assert process.returncode == 0, said
+    assert "WorkerCrashedError" in said
+    assert files_of(tmp_path / "m") == undisturbed
+
+
+def test_a_killed_driver_loses_and_duplicates_nothing(
+    start: Callable[..., Any], undisturbed: dict[str, bytes], tmp_path: Path
+) -> None:
+    process = start("m")
+    until(running_tasks)
+    process.kill()
+    process.communicate()
+    assert not (tmp_path / "m").exists()
+    until(lambda: not running_tasks())
+    process = start("m")
+    _, said = process.communicate(timeout=300)
+    assert process.returncode == 0, said
+    assert files_of(tmp_path / "m") == undisturbed
+    assert not work_folder(tmp_path / "m").exists()
