@@ -160,7 +160,9 @@ def confidences(calibration: Calibration, asked: Asked) -> NDArray[np.float64]:
 
 
 def weights_of(asked: Asked) -> NDArray[np.float64]:
-    """Return the weight of each query (n,), on average 1: families count alike, and in each the map and its outside count alike.
+    """Return the weight of each query (n,), with a mean of 1.
+
+    All families have equal weight. In each family, in-map and out-of-map queries have equal weight.
 
     Args:
         asked: the calibration data.

@@ -211,7 +211,9 @@ def gathered(chunks: Iterable[Arrays], empty: VoxelMap) -> tuple[Places, VoxelMa
     for chunk in chunks:
         cloud.add_sums(chunk["keys"], chunk["moments"])
         fields.append({name: chunk[name] for name in Places.__slots__})
-    cloud.sums()  # merges now. Later a site check may merge or not, and in single precision the order of sums shows in the last bits
+    # Merge the sums at this fixed point. The order of single-precision sums changes their last bits, and a later merge depends on
+    # whether a site check runs.
+    cloud.sums()
     sources = np.concatenate([each["sources"] for each in fields])
     row = np.empty(len(sources), np.int64)
     row[np.argsort(sources[:, 0] != sources[:, 1], kind="stable")] = np.arange(len(sources))  # those at scans first

@@ -53,7 +53,7 @@ def registered(register: Register, calibration: Calibration | None, frames: tupl
         return together
     if not agrees(belief.modes[0], together.refined.best.T_map_camera):
         return together
-    # Look-alikes move along with the robot, so single frames may agree about them. The frames together know the rivals better.
+    # A perceptual alias moves with the robot, so single frames may agree on it. The rivals of all frames together are more complete.
     confidence = decision.confidence * share_of(together.evidence)
     if confidence < calibration.threshold(frames[0].query.false_accept_rate):
         return together

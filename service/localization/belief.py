@@ -1,9 +1,9 @@
 """Belief of a moving robot: a Bayes filter over a few modes, with the odometry between the frames.
 
 Each frame is registered alone. Its candidates, their shares of the support and the calibrated confidence give a probability to each
-candidate, to the other places of the map, and to the outside. The filter multiplies them with the belief, which the odometry has moved.
-It is a Gaussian mixture filter with several hypotheses (Thrun, Burgard and Fox, Probabilistic Robotics, 2005, section 7.4) and an
-explicit probability for everything outside the modes.
+candidate, to the other places of the map, and to the outside. The odometry moves the belief. The filter multiplies it with these
+probabilities. It is a Gaussian mixture filter with several hypotheses and an explicit probability for everything outside the modes.
+Source: Thrun, Burgard and Fox, Probabilistic Robotics, 2005, section 7.4.
 """
 
 from collections.abc import Sequence
@@ -27,8 +27,8 @@ ODOMETRY_STD = (0.03, 0.02, 0.03, float(np.deg2rad(0.2)))
 #: Number of places that wrong candidates of consecutive frames are spread over. Errors repeat, because a perceptual alias moves along
 #: with the robot. So it is far below the number of places of the map.
 ALTERNATIVES = 2.0
-#: Motion after which a frame is new evidence for a mode that the last frames agreed with: metres, or radians. A robot that stands still
-#: sees one picture again and again, with the same error.
+#: Motion (metres, or radians) after which a frame is independent evidence for a mode. Images of a robot that stands still have the same
+#: error.
 NEW_M, NEW_RAD = 2.0, float(np.deg2rad(20.0))
 #: Least probability, as a share of being in the map, that no candidate of a frame is right.
 MISSED = 0.02
@@ -138,9 +138,8 @@ class Belief:
         """
         partner = _pairs(self.modes, sighting.candidates)
         first = next((self.modes[k] for k, j in partner.items() if j == 0), None)
-        news = (
-            1.0 if first is None else first.news
-        )  # a frame that finds another place than before shows another picture
+        # A frame whose best candidate is at a new place is independent of the frames before.
+        news = 1.0 if first is None else first.news
         new = sum(each.probability for j, each in enumerate(sighting.candidates) if j not in partner.values())
         rest, outside = sighting.elsewhere**news, sighting.outside**news
         modes, born = [], self.born

@@ -33,8 +33,8 @@ _OUTLIERS = 0.005
 _LINKS = 32
 #: Fewest candidates of a search in the graph. More find nearer centroids and take longer.
 _LEAST_CANDIDATES = 64
-#: The best third of the views that the codes list brings its neighbours: views of so many places before and after it in the survey,
-#: at headings so far away.
+#: The first 1 / _BRING of a list brings its neighbours into the exact search: the views of up to _PLACES places before and after
+#: in the survey, at up to _TURNS headings to each side.
 _BRING, _PLACES, _TURNS = 3, 2, 1
 #: Steps of k-means, and views for each centroid that it takes into account.
 _STEPS, _VIEWS_PER_LIST = 6, 16

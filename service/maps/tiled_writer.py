@@ -60,7 +60,7 @@ def write_tiled(
     manifests = [_opened(folder) for folder in folders]
     for folder, each in zip(folders[1:], manifests[1:], strict=True):
         if different := differences(each, manifests[0]):
-            raise BundleError(f"{folder}: {different[0]} is not that of {folders[0]}; {_REMEDY}", field="tiles")
+            raise BundleError(f"{folder}: {different[0]} differs from {folders[0]}; {_REMEDY}", field="tiles")
     remedy = "free disk space or choose another folder"
     with in_place(out, f"{out}: the map cannot be written", remedy) as partial:
         entries = [
@@ -194,7 +194,7 @@ def joined_streets(paths: Sequence[Path]) -> dict[str, Any] | None:
             known = joined.setdefault(feature["properties"]["id"], feature)
             if known != feature:
                 raise BundleError(
-                    f"{path}: the street {feature['properties']['id']!r} is not that of another tile; {_REMEDY}",
+                    f"{path}: the street {feature['properties']['id']!r} differs from another tile; {_REMEDY}",
                     field=streets.FILE,
                 )
     return {**documents[0], "features": list(joined.values())}
@@ -208,7 +208,7 @@ def _calibration(bundles: Sequence[Path], rig: RigCorrection | None) -> dict[str
     for bundle, each in zip(bundles, plain, strict=True):
         if each != plain[0]:
             raise BundleError(
-                f"{bundle}: {parts.CALIBRATION_FILE} is not that of the other tiles; {_REMEDY}", field="tiles"
+                f"{bundle}: {parts.CALIBRATION_FILE} differs from the other tiles; {_REMEDY}", field="tiles"
             )
     if first is None:
         return dict(parts.UNCALIBRATED)

@@ -330,7 +330,7 @@ class OpenTiles:
         if bundle.manifest.version != tile.version:
             raise defect(folder / manifest.FILE, f"version {bundle.manifest.version}, but the map lists {tile.version}")
         if different := differences(bundle.manifest, self._manifest):
-            raise defect(folder / manifest.FILE, f"{different[0]} is not that of the map")
+            raise defect(folder / manifest.FILE, f"{different[0]} differs from the map")
         if bundle.manifest.counts != tile.counts:
             raise defect(folder / manifest.FILE, "the counts are not those that the map lists")
         try:

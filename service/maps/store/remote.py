@@ -29,7 +29,7 @@ _RETRIES = 6
 _RETRY_FOR, _FIRST_PAUSE, _LONGEST_PAUSE = timedelta(seconds=30), timedelta(milliseconds=100), timedelta(seconds=5)
 #: A whole object may take long, but the connection and each piece may not.
 _CLIENT = {"connect_timeout": "5s", "read_timeout": "30s", "timeout": "6h"}
-#: Variable of each scheme that allows an endpoint without TLS, and what obstore tells otherwise.
+#: Environment variable of each scheme that allows an endpoint without TLS. Without it, obstore's error contains _NO_HTTP.
 _ALLOW_HTTP = {"s3": "AWS_ALLOW_HTTP", "gs": "GOOGLE_ALLOW_HTTP", "az": "AZURE_ALLOW_HTTP"}
 _NO_HTTP = "builder error"
 #: Query of an address in an error. The signature of Azure is in there.
