@@ -51,10 +51,12 @@ def command(
     from service.runtime.threads import limit_pools_before_import
 
     limit_pools_before_import()
-    from service.doctor.examine import Given, examine
+    from service.doctor.examine import DoctorInputs, examine
 
     findings = []
-    for each in examine(Given(bundle=bundle, camera=camera, rgb=rgb, depth=depth, port=port, grpc_port=grpc_port)):
+    for each in examine(
+        DoctorInputs(bundle=bundle, camera=camera, rgb=rgb, depth=depth, port=port, grpc_port=grpc_port)
+    ):
         findings.append(each)
         if not as_json:
             typer.echo(f"{each.level:<7}  {each.check}: {each.text}" + (f"; {each.remedy}" if each.remedy else ""))

@@ -19,7 +19,7 @@ from service.maps.calibration import Calibration
 from service.retrieval.hypotheses import Hypothesis
 from service.retrieval.knn import Neighbour
 from service.retrieval.retrieve import EncodedFrame
-from service.scoring.candidates import Candidate, Refined, behind, distinct_candidates, log_shares
+from service.scoring.candidates import Candidate, Refined, distinct_candidates, log_shares, support_gaps
 
 #: A neighbour further than OTHER_PLACE_M from the answer is another place (feature ``similarity_margin``).
 #: Of the first VOTERS neighbours, those within VOTE_M of the answer vote for it (feature ``votes``).
@@ -70,7 +70,7 @@ class Evidence:
     @cached_property
     def support_gaps(self) -> Float64[NDArray[np.float64], " C"]:
         """Support gap of each candidate that excludes the others to the best one, nats."""
-        return behind(distinct_candidates(self.refined.candidates), len(self.frames))
+        return support_gaps(distinct_candidates(self.refined.candidates), len(self.frames))
 
     @cached_property
     def away_m(self) -> Float64[NDArray[np.float64], " N"]:
@@ -194,7 +194,7 @@ TABLE: tuple[Feature, ...] = (
     Feature("far", "log m", "median range above the horizon", 0, lambda e: e.shape.far),
     Feature("edges", "1", "share of neighbouring cells on different surfaces", 0, lambda e: e.shape.edges),
     Feature("residual", "log 1", "disagreement of the image's patches about the pose, relative to their noise", -1,
-            lambda e: float(np.log(e.refined.disagreement)), ideal=True),
+            lambda e: float(np.log(e.refined.variance_inflation)), ideal=True),
     Feature("pose_spread", "log m", "distance of the first five neighbours from their mean", -1,
             lambda e: e.pose_spread, rivalry=True, weighted=False),
     Feature("log_share", "log 1", "share of the best candidate in the support of all candidates that exclude each other", 1,

@@ -17,8 +17,8 @@ from service.runtime.settings import Settings, load_settings
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Given:
-    """What to check.
+class DoctorInputs:
+    """Files and ports to check.
 
     Attributes:
         bundle: folder of a map bundle.
@@ -37,11 +37,11 @@ class Given:
     grpc_port: int | None = None
 
 
-def examine(given: Given) -> Iterator[Finding]:
+def examine(given: DoctorInputs) -> Iterator[Finding]:
     """Yield the finding of each check as soon as it is known.
 
     Args:
-        given: what to check.
+        given: files and ports to check.
     """
     finding, settings = check_settings(given)
     yield from _machine(given, finding, settings)
@@ -68,7 +68,7 @@ def examine(given: Given) -> Iterator[Finding]:
         yield on_map.check_answer(pair, localizer, rate)
 
 
-def check_settings(given: Given) -> tuple[Finding, Settings | None]:
+def check_settings(given: DoctorInputs) -> tuple[Finding, Settings | None]:
     """Check the settings of a service: the variables ``STREETFIX_*`` and the settings file.
 
     Args:
@@ -86,7 +86,7 @@ def check_settings(given: Given) -> tuple[Finding, Settings | None]:
     ), settings
 
 
-def _machine(given: Given, finding: Finding, settings: Settings | None) -> Iterator[Finding]:
+def _machine(given: DoctorInputs, finding: Finding, settings: Settings | None) -> Iterator[Finding]:
     yield machine.check_platform()
     yield machine.check_cores()
     yield machine.check_instructions()

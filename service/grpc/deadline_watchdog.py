@@ -25,7 +25,7 @@ class DeadlineWatchdog:
         self._stop.set()
 
     @contextmanager
-    def at_most(self, seconds: float, give_up: Callable[[], object]) -> Iterator[None]:
+    def time_limit(self, seconds: float, give_up: Callable[[], object]) -> Iterator[None]:
         """Limit the duration of the context.
 
         Args:

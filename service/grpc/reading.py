@@ -146,7 +146,7 @@ class ReadingInterceptor(_Interceptor):
         def in_turn(messages: Messages, context: grpc.ServicerContext) -> Iterator[Message]:
             while True:
                 try:
-                    with self._memory.turn_of_others(streams=True), self._watchdog.at_most(OTHERS_S, context.cancel):
+                    with self._memory.turn_of_others(streams=True), self._watchdog.time_limit(OTHERS_S, context.cancel):
                         raw = next(messages, None)
                 except StreetfixError as error:
                     self._end(error, method, context)
@@ -175,7 +175,7 @@ class ReadingInterceptor(_Interceptor):
     def _next(self, messages: Messages, method: str, context: grpc.ServicerContext, timeout_s: float) -> bytes:
         """Read the only message of a call. If none arrives, the call ends."""
         try:
-            with self._watchdog.at_most(timeout_s, context.cancel):
+            with self._watchdog.time_limit(timeout_s, context.cancel):
                 raw = next(messages, None)
         except grpc.RpcError as error:
             self._end(error, method, context)

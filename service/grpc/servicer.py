@@ -169,7 +169,7 @@ class Servicer(LocalizationServiceServicer):
         """
         with fields_under(f"frame {number}"):
             try:
-                with self._watchdog.at_most(self._engine.settings.grpc_idle_s, context.cancel):
+                with self._watchdog.time_limit(self._engine.settings.grpc_idle_s, context.cancel):
                     return next(requests, None)
             except RequestError as error:
                 error.field = error.field.removeprefix(

@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 
 from service.confidence.decision import Decision, decision_of, extrapolated, is_acceptable, share_of
 from service.geometry.rigid import Transform, inverse, nearest_rigid
-from service.localization.belief import Belief, Seen, agrees, sighting_of
-from service.localization.compose import Found
+from service.localization.belief import Belief, FrameCandidate, agrees, sighting_of
+from service.localization.compose import QueryResult
 from service.maps.calibration import Calibration
 from service.option_limits import FALSE_ACCEPT_RATE
 from service.retrieval.retrieve import EncodedFrame
@@ -18,7 +18,7 @@ from service.scoring.candidates import Candidate, distinct_candidates, shares_of
 from service.timing import stage
 
 #: Registers frames, from further start poses too (``Localizer.register``).
-Register = Callable[[tuple[EncodedFrame, ...], tuple[Transform, ...]], Found]
+Register = Callable[[tuple[EncodedFrame, ...], tuple[Transform, ...]], QueryResult]
 #: An answer by agreement needs more than this probability, whatever the false-accept rate: more than all rivals together. The belief
 #: needs it, and so does the confidence of the frames together.
 MAJORITY = 0.5
@@ -26,7 +26,7 @@ MAJORITY = 0.5
 PREDICTED = 4
 
 
-def registered(register: Register, calibration: Calibration | None, frames: tuple[EncodedFrame, ...]) -> Found:
+def registered(register: Register, calibration: Calibration | None, frames: tuple[EncodedFrame, ...]) -> QueryResult:
     """Register all frames of a query together, and accept their pose if the frames agree about it one by one.
 
     The confidence of the frames together falls short of the threshold where each frame has weak evidence. Whether they agree is other
@@ -60,7 +60,7 @@ def registered(register: Register, calibration: Calibration | None, frames: tupl
     return replace(together, decision=replace(decision, confidence=confidence))
 
 
-def is_likely(calibration: Calibration, reference: EncodedFrame, found: Found) -> bool:
+def is_likely(calibration: Calibration, reference: EncodedFrame, found: QueryResult) -> bool:
     """Return whether a pose is not LOCALIZED, but may become so if the frames agree: it has the majority, and lies in range.
 
     Args:
@@ -90,7 +90,7 @@ def agreed(calibration: Calibration, belief: Belief, false_accept_rate: float) -
     return Decision("LOCALIZED", mode.weight, 1.0 - belief.outside)
 
 
-def believed(calibration: Calibration | None, frame: EncodedFrame, alone: Found, belief: Belief) -> Belief:
+def updated_belief(calibration: Calibration | None, frame: EncodedFrame, alone: QueryResult, belief: Belief) -> Belief:
     """Return the belief after a frame. A frame outside the range of the calibration says nothing at the default false-accept rate.
 
     Args:
@@ -109,11 +109,13 @@ def believed(calibration: Calibration | None, frame: EncodedFrame, alone: Found,
         if decision is None:
             return belief.unseen()
     candidates = distinct_candidates(alone.refined.with_covariances())
-    seen = [seen_of(each, each.covariance) for each in candidates if each.covariance is not None]
+    seen = [frame_candidate_of(each, each.covariance) for each in candidates if each.covariance is not None]
     return belief.seen(sighting_of(seen, shares_of(candidates, 1), decision.confidence, decision.known))
 
 
-def seen_of(candidate: Candidate, covariance: Float64[NDArray[np.float64], "6 6"], *, probability: float = 0.0) -> Seen:
+def frame_candidate_of(
+    candidate: Candidate, covariance: Float64[NDArray[np.float64], "6 6"], *, probability: float = 0.0
+) -> FrameCandidate:
     """Return a candidate as a belief reads it.
 
     Args:
@@ -122,7 +124,7 @@ def seen_of(candidate: Candidate, covariance: Float64[NDArray[np.float64], "6 6"
         probability: that the camera is there.
     """
     inliers, similarity = candidate.registered.inliers, candidate.scores["similarity"]
-    return Seen(candidate.T_map_camera, covariance, probability, inliers, similarity)
+    return FrameCandidate(candidate.T_map_camera, covariance, probability, inliers, similarity)
 
 
 def _belief_of(register: Register, calibration: Calibration, frames: tuple[EncodedFrame, ...]) -> Belief:
@@ -139,5 +141,5 @@ def _belief_of(register: Register, calibration: Calibration, frames: tuple[Encod
         single = replace(frame, query=query, T_reference_camera=np.eye(4))
         alone = register((single,), tuple(mode.T_map_camera for mode in belief.modes[:PREDICTED]))
         with stage("register"):
-            belief = believed(calibration, single, alone, belief)
+            belief = updated_belief(calibration, single, alone, belief)
     return belief

@@ -40,7 +40,7 @@ AGREES_M, AGREES_RAD, MOST_AGREES_M = 1.0, float(np.deg2rad(15.0)), 10.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Seen:
+class FrameCandidate:
     """A candidate of one frame.
 
     Attributes:
@@ -68,7 +68,7 @@ class Sighting:
         outside: probability that the camera is outside the map.
     """
 
-    candidates: tuple[Seen, ...]
+    candidates: tuple[FrameCandidate, ...]
     elsewhere: float
     outside: float
 
@@ -178,7 +178,7 @@ class Belief:
             born += 1
         return _normalised(modes, elsewhere * (1.0 - taken * new), self.outside * outside, born)
 
-    def raised(self, seen: Seen) -> "Belief":
+    def raised(self, seen: FrameCandidate) -> "Belief":
         """Return the belief after an answer of several frames together: its pose has at least the probability of the answer.
 
         The answer uses frames that the belief knows already, so it is no further evidence.
@@ -192,9 +192,9 @@ class Belief:
             return self
         number, born = (self.born, self.born + 1) if here is None else (self.modes[here].number, self.born)
         raised = Mode(seen.T_map_camera, seen.covariance, seen.probability, number, seen.inliers, seen.similarity)
-        less = (1.0 - seen.probability) / (1.0 - weight)
-        others = [replace(mode, weight=less * mode.weight) for k, mode in enumerate(self.modes) if k != here]
-        return _normalised([raised, *others], less * self.elsewhere, less * self.outside, born)
+        scale = (1.0 - seen.probability) / (1.0 - weight)
+        others = [replace(mode, weight=scale * mode.weight) for k, mode in enumerate(self.modes) if k != here]
+        return _normalised([raised, *others], scale * self.elsewhere, scale * self.outside, born)
 
     def unseen(self) -> "Belief":
         """Return the belief after a frame that says nothing, for example because a vehicle covers it."""
@@ -202,7 +202,7 @@ class Belief:
 
 
 def sighting_of(
-    candidates: Sequence[Seen], shares: Float64[NDArray[np.float64], " C"], confidence: float, known: float
+    candidates: Sequence[FrameCandidate], shares: Float64[NDArray[np.float64], " C"], confidence: float, known: float
 ) -> Sighting:
     """Distribute the probability of one frame over its candidates, the rest of the map, and the outside.
 
@@ -278,7 +278,7 @@ def agrees(mode: Mode, T_map_camera: Transform) -> bool:
     return away_m <= min(AGREES_M + 3.0 * deviation_m, MOST_AGREES_M) and bool(np.cos(turned) >= np.cos(AGREES_RAD))
 
 
-def _pairs(modes: Sequence[Mode], candidates: Sequence[Seen]) -> dict[int, int]:
+def _pairs(modes: Sequence[Mode], candidates: Sequence[FrameCandidate]) -> dict[int, int]:
     """Assign candidates to modes that they agree with, the nearest first."""
     near = [
         (float(np.hypot(*(one.T_map_camera[:2, 3] - mode.T_map_camera[:2, 3]))), k, j)

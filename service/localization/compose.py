@@ -23,8 +23,8 @@ VERIFIED_M = 5.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Found:
-    """What a query has found before its answer is built.
+class QueryResult:
+    """Results of the stages of a query, from which its answer is built.
 
     Attributes:
         retrieved: places, clusters and street vote of the reference.
@@ -39,7 +39,7 @@ class Found:
     decision: Decision | None
 
 
-def compose(bundle: Map, frames: tuple[EncodedFrame, ...], found: Found, extent: Extent) -> Answer:
+def compose(bundle: Map, frames: tuple[EncodedFrame, ...], found: QueryResult, extent: Extent) -> Answer:
     """Build an answer from the results of all stages.
 
     Args:

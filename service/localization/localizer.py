@@ -10,7 +10,7 @@ from service.confidence.spread import Extent
 from service.geometry.rigid import Transform
 from service.localization.agreement import registered
 from service.localization.answer import Answer
-from service.localization.compose import Found, compose
+from service.localization.compose import QueryResult, compose
 from service.localization.refine import RefineSettings, refine
 from service.maps.map import Map
 from service.retrieval.encoder import Encoder, Provider
@@ -121,7 +121,7 @@ class Localizer:
         """
         return self.compose(frames, registered(self.register, self.bundle.calibration, frames))
 
-    def register(self, frames: tuple[EncodedFrame, ...], predicted: tuple[Transform, ...] = ()) -> Found:
+    def register(self, frames: tuple[EncodedFrame, ...], predicted: tuple[Transform, ...] = ()) -> QueryResult:
         """Retrieve, register and decide, without the parts of an answer that only its reader needs.
 
         Args:
@@ -147,9 +147,9 @@ class Localizer:
             evidence = None if refined is None else evidence_of(frames, refined, near, clusters, places_m, bundle.grid)
             # 4. Decision: status and calibrated confidence.
             decision = None if cloud is None else decision_of(bundle.calibration, query, refined, evidence)
-            return Found(retrieved, refined, evidence, decision)
+            return QueryResult(retrieved, refined, evidence, decision)
 
-    def compose(self, frames: tuple[EncodedFrame, ...], found: Found) -> Answer:
+    def compose(self, frames: tuple[EncodedFrame, ...], found: QueryResult) -> Answer:
         """Build the answer.
 
         Args:

@@ -12,10 +12,10 @@ from service.registration.covariance import (
     OF_POINTS,
     OF_RAYS,
     covariance_of,
-    disagreement,
     rectification_covariance,
     score_outer_product,
     survey_covariance,
+    variance_inflation,
 )
 from service.registration.local_search import LocalSearchSettings, search_locally
 from service.registration.points import FOCAL_BASELINE_PX_M, PointSettings
@@ -171,7 +171,7 @@ def refine(
         covariance=of_registration + systematic,
         registration_covariance=of_registration,
         points=len(points),
-        disagreement=disagreement(best.information, scatter),
+        variance_inflation=variance_inflation(best.information, scatter),
         confirmation=confirm(cloud, scorer.structure, best),
         covariance_at=covariance_at,
     )
@@ -191,6 +191,6 @@ def _starts_at(
     T_map_level = np.stack([transform_from(T[:3, :3] @ reference.R_level_camera.T, T[:3, 3]) for T in predicted])
     similarity, _ = similarity_of(bundle, measured, T_map_level)
     return [
-        Start(T[:3, :3], T[:3, 3], first + k, float(alike))
-        for k, (T, alike) in enumerate(zip(T_map_level, similarity, strict=True))
+        Start(T[:3, :3], T[:3, 3], first + k, float(cosine))
+        for k, (T, cosine) in enumerate(zip(T_map_level, similarity, strict=True))
     ]

@@ -7,10 +7,10 @@ import numpy as np
 
 from service.confidence.decision import Decision
 from service.geometry.rigid import Transform, inverse, nearest_rigid
-from service.localization.agreement import PREDICTED, agreed, believed, is_likely, seen_of
+from service.localization.agreement import PREDICTED, agreed, frame_candidate_of, is_likely, updated_belief
 from service.localization.answer import Answer, require_finite
 from service.localization.belief import Belief, Mode, agrees, moved, size_of
-from service.localization.compose import Found
+from service.localization.compose import QueryResult
 from service.localization.localizer import Localizer
 from service.retrieval.retrieve import EncodedFrame
 from service.scoring.candidates import RIVAL_M
@@ -89,13 +89,13 @@ def follow(
     predicted = tuple(mode.T_map_camera for mode in belief.modes[:PREDICTED])
     alone = localizer.register((frame,), predicted)
     with stage("register"):
-        belief = believed(bundle.calibration, frame, alone, belief)
+        belief = updated_belief(bundle.calibration, frame, alone, belief)
     if _is_overtaken(last, belief):
         kept = ()
     answer = _answer(localizer, (frame, *_apart(kept)), alone, belief)
     epoch = track.epoch
     if answer.status == "LOCALIZED" and answer.candidates and answer.covariance is not None:
-        found = seen_of(answer.candidates[0], answer.covariance, probability=answer.confidence or 0.0)
+        found = frame_candidate_of(answer.candidates[0], answer.covariance, probability=answer.confidence or 0.0)
         epoch += int(last is not None and not agrees(last, found.T_map_camera))
         belief = belief.raised(found)
         last = Mode(found.T_map_camera, found.covariance, found.probability, 0, found.inliers, found.similarity)
@@ -128,7 +128,7 @@ def _is_overtaken(last: Mode | None, belief: Belief) -> bool:
     return not agrees(last, first.T_map_camera) and first.weight > max(belief.elsewhere, belief.outside)
 
 
-def _answer(localizer: Localizer, frames: tuple[EncodedFrame, ...], alone: Found, belief: Belief) -> Answer:
+def _answer(localizer: Localizer, frames: tuple[EncodedFrame, ...], alone: QueryResult, belief: Belief) -> Answer:
     """Build the answer from the frame alone, else from all frames together, else from the belief: the first that is accepted."""
     ceiling = partial(_ceiling, alone=alone, belief=belief)
     if _is_localized(alone) and ceiling(alone) > CONTRADICTED:
@@ -153,11 +153,11 @@ def _answer(localizer: Localizer, frames: tuple[EncodedFrame, ...], alone: Found
     return localizer.compose(used, found)
 
 
-def _is_localized(found: Found) -> bool:
+def _is_localized(found: QueryResult) -> bool:
     return found.decision is not None and found.decision.status == "LOCALIZED"
 
 
-def _ceiling(found: Found, alone: Found, belief: Belief) -> float:
+def _ceiling(found: QueryResult, alone: QueryResult, belief: Belief) -> float:
     """Return an upper limit of the probability of an answer: what its rivals in the belief and in the newest frame leave.
 
     Frames from before a displacement may outvote the newest frame.

@@ -49,7 +49,7 @@ _NOISE = 0.6
 #: Recall to reach, and factor by which the number of lists that a search reads grows until then.
 _WANTED, _GROWTH = 0.992, 2**0.5
 _REMEDY = "copy or build the bundle again"
-_Asked = Float32[NDArray[np.float32], "q D"]
+_QueryDescriptors = Float32[NDArray[np.float32], "q D"]
 #: FAISS without its type stubs, which lack many of the classes and fields that this file uses.
 _faiss: Any = faiss
 
@@ -157,12 +157,12 @@ class InvertedFile:
 
     def _by_codes(self, descriptor: Float32[NDArray[np.float32], " D"], k: int) -> Int64[NDArray[np.int64], " n"]:
         """Return the k most similar views by their codes, the best first. Fewer only if the graph does not lead to all lists."""
-        asked, probes = self._axes.apply(descriptor[None]), self.probes
+        queries, probes = self._axes.apply(descriptor[None]), self.probes
         while True:
             # The graph finds the nearest centroids only if it keeps as many candidates as it shall return.
             graph = _faiss.SearchParametersHNSW(efSearch=max(probes, _LEAST_CANDIDATES))
             reading = _faiss.SearchParametersIVF(nprobe=probes, quantizer_params=graph)
-            found: NDArray[np.int64] = self._lists.search(asked, k, params=reading)[1][0]
+            found: NDArray[np.int64] = self._lists.search(queries, k, params=reading)[1][0]
             found = found[found >= 0]
             if len(found) == k or probes >= self.lists:
                 return found
@@ -232,19 +232,19 @@ def _choose_probes(whole: Any, numbers: Rows, headings: int) -> float:
         numbers: their descriptors.
         headings: number of views per place.
     """
-    asked = _queries(numbers)
-    tenth = _tenth_best(numbers, asked)
+    queries = _queries(numbers)
+    tenth = _tenth_best(numbers, queries)
     inverted, opened = _faiss.downcast_index(whole.index), InvertedFile(whole, headings)
     probes = 1.0
     while True:
         inverted.nprobe = min(round(probes), inverted.nlist)
-        recall = recall_of(opened, numbers, asked, tenth)
+        recall = recall_of(opened, numbers, queries, tenth)
         if recall >= _WANTED or inverted.nprobe == inverted.nlist:
             return recall
         probes *= _GROWTH
 
 
-def recall_of(opened: Shortlister, numbers: Rows, asked: _Asked, tenth: NDArray[np.float32]) -> float:
+def recall_of(opened: Shortlister, numbers: Rows, queries: _QueryDescriptors, tenth: NDArray[np.float32]) -> float:
     """Return the share of the ten most similar views that the shortlist has, mean over all queries.
 
     Views as similar as the tenth count as much as the tenth.
@@ -252,32 +252,32 @@ def recall_of(opened: Shortlister, numbers: Rows, asked: _Asked, tenth: NDArray[
     Args:
         opened: the index.
         numbers: descriptors of all views (n, D).
-        asked: descriptors of the queries (q, D).
+        queries: descriptors of the queries (q, D).
         tenth: similarity of each query's tenth best view (q,).
     """
     best, listed = min(_BEST, len(numbers)), min(_LISTED, len(numbers))
     found = 0
-    for query, least in zip(asked, tenth, strict=True):
+    for query, least in zip(queries, tenth, strict=True):
         similarity = vectors_of(numbers[opened.shortlist(query, listed)]) @ query
         found += min(best, int((similarity >= least - 1e-6).sum()))
-    return found / (best * len(asked))
+    return found / (best * len(queries))
 
 
-def _queries(numbers: Rows) -> _Asked:
+def _queries(numbers: Rows) -> _QueryDescriptors:
     """Return views with the noise of two views of one place. Its spectrum is that of the map's own descriptors."""
     rng = np.random.default_rng(0)
     count = min(_QUERIES, len(numbers))
     view, one, other = (vectors_of(numbers[np.sort(rng.integers(len(numbers), size=count))]) for _ in range(3))
     noisy = view + _NOISE * (one - rng.permutation(other))
-    asked: _Asked = noisy / np.maximum(np.linalg.norm(noisy, axis=1, keepdims=True), 1e-12)
-    return asked
+    queries: _QueryDescriptors = noisy / np.maximum(np.linalg.norm(noisy, axis=1, keepdims=True), 1e-12)
+    return queries
 
 
-def _tenth_best(numbers: Rows, asked: _Asked) -> Float32[NDArray[np.float32], " q"]:
+def _tenth_best(numbers: Rows, queries: _QueryDescriptors) -> Float32[NDArray[np.float32], " q"]:
     """Return the similarity of the tenth best view of each query by exact search, or of the last one of fewer views."""
-    kept = np.full((len(asked), min(_BEST, len(numbers))), -np.inf, np.float32)
+    kept = np.full((len(queries), min(_BEST, len(numbers))), -np.inf, np.float32)
     for first in range(0, len(numbers), _CHUNK):
-        similar = asked @ vectors_of(numbers[first : first + _CHUNK]).T
+        similar = queries @ vectors_of(numbers[first : first + _CHUNK]).T
         least = kept.min(axis=1, keepdims=True)
         for query in np.flatnonzero((similar > least).any(axis=1)):
             both = np.concatenate([kept[query], similar[query][similar[query] > least[query]]])

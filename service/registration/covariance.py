@@ -23,7 +23,7 @@ PATCH_RAD = 0.2
 #: Least eigenvalue of the normalised information (unit diagonal) of an observable direction. For comparison: a wall's distance against
 #: the scale has 4e-6.
 _OBSERVABLE = 1e-4
-#: Least disagreement. Its logarithm is a confidence feature, so it must not be 0.
+#: Least variance inflation. Its logarithm is a confidence feature, so it must not be 0.
 _LEAST = 1e-6
 
 
@@ -170,7 +170,7 @@ def score_outer_product(
     return scatter
 
 
-def disagreement(
+def variance_inflation(
     information: Float64[NDArray[np.float64], "8 8"], scatter: Float64[NDArray[np.float64], "8 8"]
 ) -> float:
     """Return the mean ratio of scatter to information (variances); it is 1 if the noise explains the residuals.

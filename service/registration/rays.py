@@ -297,11 +297,11 @@ def _normal_equations(
             byref(error),
         )
         if with_scatter:
-            scatter += _scatter_of(gradients)
+            scatter += _score_outer_product(gradients)
     return _NormalEquations(H, b, scatter, int(pixels), error.value)
 
 
-def _scatter_of(gradients: NDArray[np.float64]) -> NDArray[np.float64]:
+def _score_outer_product(gradients: NDArray[np.float64]) -> NDArray[np.float64]:
     """Sum of the outer products of the gradients, joined over 2 x 2 patches because a car that has moved is as wide.
 
     The factor for few patches is as in ``score_outer_product``.

@@ -106,8 +106,8 @@ def _near(matches: ViewMatches, count: int, settings: ClusterSettings) -> Bool[N
     at, heading_rad = matches.T_map_place[:count, :2, 3], matches.heading_rad[:count]
     offset_m = at[:, None] - at
     close = np.hypot(offset_m[..., 0], offset_m[..., 1]) <= settings.radius_m
-    alike = np.cos(heading_rad[:, None] - heading_rad) >= np.cos(settings.heading_rad)
-    near: Bool[NDArray[np.bool_], "n n"] = close & alike
+    same_heading = np.cos(heading_rad[:, None] - heading_rad) >= np.cos(settings.heading_rad)
+    near: Bool[NDArray[np.bool_], "n n"] = close & same_heading
     return near
 
 

@@ -140,9 +140,14 @@ def distinct_places(matches: ViewMatches, count: int) -> tuple[Neighbour, ...]:
     positions_m = matches.T_map_place[rows, :3, 3]
     return tuple(
         Neighbour(
-            place=place, similarity=alike, distance=apart, street=street, position_m=position_m, heading_rad=heading_rad
+            place=place,
+            similarity=cosine,
+            distance=apart,
+            street=street,
+            position_m=position_m,
+            heading_rad=heading_rad,
         )
-        for place, alike, apart, street, heading_rad, position_m in zip(
+        for place, cosine, apart, street, heading_rad, position_m in zip(
             *(column.tolist() for column in columns), positions_m, strict=True
         )
     )

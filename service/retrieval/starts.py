@@ -143,7 +143,7 @@ def _distinct(
         if len(kept) == most:
             break
         near = np.hypot(*(xy[kept] - xy[row]).T) < settings.apart_m
-        alike = np.cos(heading[kept] - heading[row]) > np.cos(settings.apart_rad)
-        if not (near & alike).any():
+        same_heading = np.cos(heading[kept] - heading[row]) > np.cos(settings.apart_rad)
+        if not (near & same_heading).any():
             kept.append(int(row))
     return kept

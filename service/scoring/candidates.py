@@ -47,7 +47,7 @@ class Refined:
         covariance: of the best candidate: translation (m), then rotation (rad), in map axes, about the camera.
         registration_covariance: the part of it without the errors of the survey and of a stereo pair's rectification.
         points: number of registered points, over all frames.
-        disagreement: variance inflation at the best pose: how much the image patches disagree about it, relative to their noise.
+        variance_inflation: how much the image patches disagree about the best pose: ratio of variances to those of their noise.
         confirmation: comparison of the best pose with poses next to it.
         covariance_at: function that computes the covariance of a candidate without ray adjustment: of every one but the best.
     """
@@ -56,7 +56,7 @@ class Refined:
     covariance: Float64[NDArray[np.float64], "6 6"]
     registration_covariance: Float64[NDArray[np.float64], "6 6"]
     points: int
-    disagreement: float
+    variance_inflation: float
     confirmation: Confirmation
     covariance_at: Callable[[Candidate], Float64[NDArray[np.float64], "6 6"]]
 
@@ -121,7 +121,7 @@ def _distinct(candidates: tuple[Candidate, ...]) -> list[int]:
     return kept
 
 
-def behind(distinct: tuple[Candidate, ...], frames: int) -> Float64[NDArray[np.float64], " C"]:
+def support_gaps(distinct: tuple[Candidate, ...], frames: int) -> Float64[NDArray[np.float64], " C"]:
     """Compute the support gap of each candidate to the best one, nats.
 
     The gap grows with the square root of the number of frames, because the noise of their mean support falls with it.
@@ -131,19 +131,19 @@ def behind(distinct: tuple[Candidate, ...], frames: int) -> Float64[NDArray[np.f
         frames: number of image pairs in the query.
     """
     support = np.array([candidate.support for candidate in distinct])
-    less: Float64[NDArray[np.float64], " C"] = np.sqrt(frames) * (support[0] - support)
-    return less
+    gaps: Float64[NDArray[np.float64], " C"] = np.sqrt(frames) * (support[0] - support)
+    return gaps
 
 
-def log_shares(less: Float64[NDArray[np.float64], " C"]) -> Float64[NDArray[np.float64], " C"]:
+def log_shares(gaps: Float64[NDArray[np.float64], " C"]) -> Float64[NDArray[np.float64], " C"]:
     """Compute the log of each candidate's share of the support: a log softmax.
 
     Two candidates with equal support have a share of 1/2 each, six have 1/6 each.
 
     Args:
-        less: support gaps, as returned by ``behind``, nats.
+        gaps: support gaps, as returned by ``support_gaps``, nats.
     """
-    shares: Float64[NDArray[np.float64], " C"] = -less - np.log(np.exp(-less).sum())
+    shares: Float64[NDArray[np.float64], " C"] = -gaps - np.log(np.exp(-gaps).sum())
     return shares
 
 
@@ -156,5 +156,5 @@ def shares_of(distinct: tuple[Candidate, ...], frames: int) -> Float64[NDArray[n
     """
     if not distinct:
         return np.zeros(0)
-    shares: Float64[NDArray[np.float64], " C"] = np.exp(log_shares(behind(distinct, frames)))
+    shares: Float64[NDArray[np.float64], " C"] = np.exp(log_shares(support_gaps(distinct, frames)))
     return shares

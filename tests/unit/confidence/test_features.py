@@ -19,9 +19,9 @@ from service.scoring.confirmation import Confirmation
 CONFIRMATION = Confirmation(upper_front=0.03, contrast=0.2, along_residual=1.7, along_edges=0.1)
 
 
-def refined(*candidates, covariance=None, points=1500, disagreement=1.0):
+def refined(*candidates, covariance=None, points=1500, variance_inflation=1.0):
     own = np.eye(6) if covariance is None else covariance
-    return Refined(candidates, own + np.eye(6), own, points, disagreement, CONFIRMATION, lambda _: np.eye(6))
+    return Refined(candidates, own + np.eye(6), own, points, variance_inflation, CONFIRMATION, lambda _: np.eye(6))
 
 
 def neighbour(x, similarity=0.5, *, y=0.0, z=0.0):
@@ -247,7 +247,7 @@ def test_the_shape_is_that_of_the_view_straight_ahead(frame, weighed):
 
 
 def test_the_residual_is_the_logarithm_of_the_patches_disagreement(weighed):
-    assert weighed(disagreement=np.e**2)["residual"] == pytest.approx(2.0)
+    assert weighed(variance_inflation=np.e**2)["residual"] == pytest.approx(2.0)
 
 
 @pytest.mark.parametrize(

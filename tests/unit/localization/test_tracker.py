@@ -14,7 +14,7 @@ from service.confidence.features import FEATURES
 from service.geometry.rigid import transform_from
 from service.localization import agreement
 from service.localization.belief import KIDNAPPED, KIDNAPPED_ON_THE_WAY, NEW_M
-from service.localization.compose import Found
+from service.localization.compose import QueryResult
 from service.localization.localizer import Localizer
 from service.localization.track_bytes import MOST_BYTES, packed, unpacked
 from service.localization.tracker import MOST_FRAMES, Track, follow
@@ -38,13 +38,13 @@ def candidate(x: float, support: float) -> Candidate:
     return Candidate(T, registered, {"similarity": 0.8}, support, SMALL)
 
 
-def found(confidence: float, *places: tuple[float, float], known: float | None = None) -> Found:
+def found(confidence: float, *places: tuple[float, float], known: float | None = None) -> QueryResult:
     """Return a registration with candidates (x, share of the support)."""
     candidates = tuple(candidate(x, math.log(share)) for x, share in places)
     refined = Refined(candidates, SMALL, SMALL, 500, 1.0, Confirmation(0.0, 0.2, 1.7, 0.1), lambda _: SMALL)
     known = max(confidence, 0.98) if known is None else known
     status: Status = "LOCALIZED" if confidence >= THRESHOLD and places[0][1] > 0.5 else "AMBIGUOUS"
-    return Found(Retrieved((), (), None), refined, np.zeros(len(FEATURES)), Decision(status, confidence, known))
+    return QueryResult(Retrieved((), (), None), refined, np.zeros(len(FEATURES)), Decision(status, confidence, known))
 
 
 def calibration(threshold: float) -> Calibration:
@@ -64,19 +64,19 @@ def in_range(monkeypatch: pytest.MonkeyPatch, outside: tuple[tuple[str, float], 
 class Scripted(Localizer):
     """A localizer whose registrations are given: ``alone`` for each frame, and ``together`` for several of them."""
 
-    def __init__(self, template: Any, alone: list[Found], together: Found | None = None) -> None:
+    def __init__(self, template: Any, alone: list[QueryResult], together: QueryResult | None = None) -> None:
         self.template, self.alone, self.together = template, iter(alone), together
         self.bundle: Any = SimpleNamespace(cloud=True, calibration=calibration(THRESHOLD))
         self.predicted: list[int] = []
 
-    def register(self, frames: tuple[EncodedFrame, ...], predicted: tuple[Any, ...] = ()) -> Found:
+    def register(self, frames: tuple[EncodedFrame, ...], predicted: tuple[Any, ...] = ()) -> QueryResult:
         if len(frames) > 1:
             assert self.together is not None
             return self.together
         self.predicted.append(len(predicted))
         return next(self.alone)
 
-    def compose(self, frames: tuple[EncodedFrame, ...], what: Found) -> Any:
+    def compose(self, frames: tuple[EncodedFrame, ...], what: QueryResult) -> Any:
         assert what.refined is not None
         assert what.decision is not None
         return replace(
@@ -96,7 +96,7 @@ def drive(localizer, frame, monkeypatch):
     in_range(monkeypatch)
     template = localizer.answer((frame,))
 
-    def run(alone: list[Found], together: Found | None = None) -> list[tuple[float, str, int, int]]:
+    def run(alone: list[QueryResult], together: QueryResult | None = None) -> list[tuple[float, str, int, int]]:
         scripted, track = Scripted(template, alone, together), Track()
         answers: list[tuple[float, str, int, int]] = []
         for number in range(len(alone)):

@@ -240,9 +240,9 @@ def test_neighbouring_patches_scatter_as_one():
     """Patches are joined two by two. Opposite gradients of neighbours cancel, and odd sizes lose no patch."""
     gradients = np.zeros((3, 5, 8))
     gradients[0, 0, 0], gradients[0, 1, 0] = 2.0, -2.0
-    assert not rays._scatter_of(gradients).any()
+    assert not rays._score_outer_product(gradients).any()
     gradients[2, 4, 1] = 3.0
-    np.testing.assert_allclose(rays._scatter_of(gradients), np.diag([0, 9.0, 0, 0, 0, 0, 0, 0]))
+    np.testing.assert_allclose(rays._score_outer_product(gradients), np.diag([0, 9.0, 0, 0, 0, 0, 0, 0]))
 
 
 @given(st.tuples(*[st.floats(-3, 3)] * 3), st.sampled_from([1.0, 1e-3, 1e-6, 0.0]))

@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from service.geometry.rigid import R_BODY_OPTICAL, rotation_y, rotation_z, transform_from
-from service.scoring.candidates import behind, distinct_candidates, is_rival, log_shares
+from service.scoring.candidates import distinct_candidates, is_rival, log_shares, support_gaps
 
 
 @pytest.mark.parametrize(
@@ -35,14 +35,14 @@ def test_of_each_place_the_best_supported_is_kept(candidate):
     assert distinct_candidates(()) == ()
 
 
-@pytest.mark.parametrize(("frames", "less"), [(1, [0, 1, 4]), (4, [0, 2, 8])])
-def test_support_gaps_grow_with_the_root_of_the_number_of_frames(candidate, frames, less):
+@pytest.mark.parametrize(("frames", "gaps"), [(1, [0, 1, 4]), (4, [0, 2, 8])])
+def test_support_gaps_grow_with_the_root_of_the_number_of_frames(candidate, frames, gaps):
     supports = [candidate(support, xyz=(20 * k, 0, 1.5)) for k, support in enumerate([10.0, 9.0, 6.0])]
-    np.testing.assert_allclose(behind(tuple(supports), frames), less)
+    np.testing.assert_allclose(support_gaps(tuple(supports), frames), gaps)
 
 
 @given(st.lists(st.floats(0, 700), max_size=8))
-def test_shares_add_to_one_and_the_best_one_has_the_most(less):
-    shares = np.exp(log_shares(np.array([0.0, *less])))
+def test_shares_add_to_one_and_the_best_one_has_the_most(gaps):
+    shares = np.exp(log_shares(np.array([0.0, *gaps])))
     assert shares.sum() == pytest.approx(1.0)
     assert shares[0] == shares.max()

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from service.registration.covariance import PATCH_RAD, disagreement, patches, score_outer_product
+from service.registration.covariance import PATCH_RAD, patches, score_outer_product, variance_inflation
 from service.registration.kernel import align, gradients
 from service.registration.register import Registered, RegistrationSettings
 from service.registration.surfel_map import SurfelMap
@@ -226,17 +226,17 @@ def test_points_that_err_together_scatter_as_often_more_as_a_patch_has_of_them(m
 
 
 @pytest.mark.parametrize(("patchwise", "expected"), [(False, 1.0), (True, 25.0)])
-def test_disagreement_is_how_many_times_more_the_patches_scatter_than_points_would(
+def test_variance_inflation_is_how_many_times_more_the_patches_scatter_than_points_would(
     mean_scatter, information, patchwise, expected
 ):
     """A wall ahead leaves half of the unknowns unobservable. They do not count."""
-    assert disagreement(information, mean_scatter(patchwise=patchwise)) == pytest.approx(expected, rel=0.2)
+    assert variance_inflation(information, mean_scatter(patchwise=patchwise)) == pytest.approx(expected, rel=0.2)
 
 
-def test_disagreement_by_hand_in_any_units():
+def test_variance_inflation_by_hand_in_any_units():
     """Two unknowns scatter two and four times as much as expected, so the mean is three. The others are unobservable."""
     information = np.diag([4.0, 1e-4, 0, 0, 0, 0, 0, 0])
     scatter = np.diag([8.0, 4e-4, 0, 0, 0, 0, 0, 9.0])
-    assert disagreement(information, scatter) == pytest.approx(3.0)
-    assert disagreement(np.zeros((8, 8)), scatter) == 1.0
-    assert disagreement(information, np.zeros((8, 8))) > 0  # its logarithm is a feature
+    assert variance_inflation(information, scatter) == pytest.approx(3.0)
+    assert variance_inflation(np.zeros((8, 8)), scatter) == 1.0
+    assert variance_inflation(information, np.zeros((8, 8))) > 0  # its logarithm is a feature
