@@ -157,12 +157,12 @@ class InvertedFile:
 
     def _by_codes(self, descriptor: Float32[NDArray[np.float32], " D"], k: int) -> Int64[NDArray[np.int64], " n"]:
         """Return the k most similar views by their codes, the best first. Fewer only if the graph does not lead to all lists."""
-        queries, probes = self._axes.apply(descriptor[None]), self.probes
+        query, probes = self._axes.apply(descriptor[None]), self.probes
         while True:
             # The graph finds the nearest centroids only if it keeps as many candidates as it shall return.
             graph = _faiss.SearchParametersHNSW(efSearch=max(probes, _LEAST_CANDIDATES))
             reading = _faiss.SearchParametersIVF(nprobe=probes, quantizer_params=graph)
-            found: NDArray[np.int64] = self._lists.search(queries, k, params=reading)[1][0]
+            found: NDArray[np.int64] = self._lists.search(query, k, params=reading)[1][0]
             found = found[found >= 0]
             if len(found) == k or probes >= self.lists:
                 return found
