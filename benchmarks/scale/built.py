@@ -137,7 +137,7 @@ def _against_ray(report: Report, dataset: Dataset, work: Path) -> None:
             shutil.rmtree(work, ignore_errors=True)
             began = time.monotonic()
             made = build_tiled(
-                dataset, ENCODER, work / engine, settings, tile_m=_TILE_M, engine=engine, workers=cores, tell=print
+                dataset, ENCODER, work / engine, settings, tile_m=_TILE_M, engine=engine, workers=cores, warn=print
             )
             times.append(time.monotonic() - began)
             versions.add(made.version)

@@ -1,8 +1,8 @@
 """Labelled frames from a recording of the robot itself: ``streetfix calibrate --map M --drive DATASET``.
 
-Each image pair is one query. Ground truth labels its answer, else the odometry does (``odometry_labels``). Each frame in the map is asked
-a second time, in the map without the places around it (``elsewhere``). So the same images also show what an out-of-map query of this rig
-gets.
+Each image pair is one query. Ground truth labels its answer, else the odometry does (``odometry_labels``). Each in-map frame
+is localized a second time, in the map without the places around it (``elsewhere``). So the same images also show the confidence of
+out-of-map queries of this rig.
 """
 
 from collections.abc import Callable, Sequence
@@ -22,7 +22,7 @@ from service.localization.answer import Answer
 from service.localization.localizer import Localizer
 from service.maps.calibration import RIGHT_M
 
-#: Largest number of frames that are asked a second time, evenly spread over a query set.
+#: Largest number of frames that are localized a second time, evenly spread over a query set.
 MOST_ELSEWHERE = 300
 #: Progress callback: stage, finished steps, all steps.
 Report = Callable[[str, int, int], None]

@@ -27,7 +27,7 @@ LEAST_SCALE = 0.2
 _SCALES, _OFFSETS = (0.2, 0.35, 0.5, 0.75, 1.0, 1.5), (-4.0, -2.0, -1.0, -0.5, 0.0, 0.5, 1.0, 2.0)
 #: Number of blocks of the cross-validation.
 BLOCKS = 5
-#: Share of wrong answers among accepted answers that a robot's owner usually asks for. The report says whether the frames support it.
+#: Share of wrong answers among accepted answers that a robot's owner usually requires. The report states whether the frames support it.
 WRONG_RATE = 0.01
 #: Frames in a bin of the calibration error, at least, and the largest number of bins.
 _BIN_FRAMES, _BINS = 20, 15
@@ -81,7 +81,7 @@ def learn_correction(
     """Fit the correction, measure it by cross-validation, and bound the share of wrong answers.
 
     The correction may only lower the confidence (``lower_only``) in three cases: the images are rendered, there is no out-of-map frame, or
-    a threshold would let through more out-of-map frames than its rate. If the correction does not improve the cross-validated log loss,
+    a threshold would accept more out-of-map frames than its rate. If the correction does not improve the cross-validated log loss,
     there is none: scale 1 and offset 0.
 
     Args:
@@ -320,7 +320,7 @@ def _cross_validated(
 
 
 def _keeps_rates(calibration: Calibration, before: NDArray[np.float64], after: NDArray[np.float64]) -> bool:
-    """Return whether no threshold lets through more out-of-map frames than its rate, or no more than before the correction."""
+    """Return whether no threshold accepts more out-of-map frames than its rate, or no more than before the correction."""
     for each in calibration.thresholds:
         passed, earlier = (float(np.mean(confidence >= each.confidence)) for confidence in (after, before))
         if passed > max(each.false_accept_rate, earlier):

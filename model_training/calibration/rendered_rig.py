@@ -1,7 +1,7 @@
 """Labelled frames of a rig without a recording: images are rendered from the map (``streetfix calibrate --map M --rig rig.json``).
 
 A rendered image shows surfels of the map, with the depth errors of the rig. Its pose is known, so its answer has a label. Each image is
-asked a second time in the map without the places around its pose (``elsewhere``). There every answer is wrong.
+localized a second time in the map without the places around its pose (``elsewhere``). There every answer is wrong.
 
 A rendered image is easier than one of a camera: the surfels and the map views come from the same survey. So rendered images can show that
 confidence is too high, and never that it is too low (decisions 0030, 0150).
@@ -39,7 +39,7 @@ from service.registration.surfel_tiles import Cloud
 from service.registration.visibility import DiscSettings, SurfelRaycaster
 from service.retrieval.query import Query
 
-#: Largest number of rendered images. Each is asked twice.
+#: Largest number of rendered images. Each is localized twice.
 IMAGES = 60
 #: Largest distance of a camera from the survey's track, metres, and standard deviations of its heading against the track, of pitch and of
 #: roll, degrees. Half of the cameras look against the direction of the survey.
@@ -231,12 +231,12 @@ def frames_of_rig(
             pairs.append(pair)
             report("rendered images", len(pairs), count)
     block = blocks_of(count)
-    there = [(None, False, None) if pair is None else pair for pair in pairs]
+    answered = [(None, False, None) if pair is None else pair for pair in pairs]
     none, all_ = np.zeros(count, bool), np.ones(count, bool)
     return joined_frames(
         [
-            frames_of([pair[0] for pair in there], np.array([pair[1] for pair in there], bool), none, block),
-            frames_of([pair[2] for pair in there], none, all_, block),
+            frames_of([pair[0] for pair in answered], np.array([pair[1] for pair in answered], bool), none, block),
+            frames_of([pair[2] for pair in answered], none, all_, block),
         ]
     )
 

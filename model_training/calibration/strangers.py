@@ -131,11 +131,11 @@ def _picture(boxes: list[Box], camera: PinholeCamera, model: DepthModel, rng: np
     depths = np.stack([box.entered(rays) for box in boxes])
     seen = depths.argmin(axis=0)
     depth = depths.min(axis=0)
-    there = depth < _FAR
+    is_hit = depth < _FAR
     bare = rng.random(len(boxes)) < 0.5  # without texture, so stereo matching returns wrong depth there
     measured = measured_depth(
-        np.where(there, depth, 0).astype(np.float32), bare[seen] & there, model, CONDITIONS["clear"], rng
+        np.where(is_hit, depth, 0).astype(np.float32), bare[seen] & is_hit, model, CONDITIONS["clear"], rng
     )
     colours = rng.uniform(40, 210, (len(boxes), 1)) + rng.normal(0, 15, (len(boxes), 3))
-    light = np.where(there[..., None], colours[seen], 235.0) + rng.normal(0, 4, (*seen.shape, 1))
+    light = np.where(is_hit[..., None], colours[seen], 235.0) + rng.normal(0, 4, (*seen.shape, 1))
     return Query(rgb=np.clip(light, 0, 255).astype(np.uint8), depth_m=measured, camera=camera)

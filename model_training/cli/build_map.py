@@ -163,6 +163,6 @@ def command(
                 workers=workers,
                 overwrite=overwrite,
                 report=report,
-                tell=lambda text: typer.echo(text, err=True),
+                warn=lambda text: typer.echo(text, err=True),
             )
     Console().print(f"{describe(manifest)}: {out}")

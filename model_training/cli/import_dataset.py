@@ -144,7 +144,7 @@ def command(
         hold_out=hold_out,
         hold_out_first=hold_out_first,
     )
-    told = OpenSettings(
+    open_settings = OpenSettings(
         depth=cast(DepthFrom, depth or "recorded"),
         topics=_topics(topic or []),
         rectified=rectified,
@@ -160,7 +160,7 @@ def command(
         )
     if odometry and align:
         raise DatasetError("align: --odometry finds poses from the scans alone; give one of the two", field="align")
-    recording = open_recording(kind, source, told)
+    recording = open_recording(kind, source, open_settings)
     console = Console()
     for line in (*recording.notes.lines, *(recording.notes.picture_lines if pictures else ())):
         console.print(line, soft_wrap=True)
@@ -177,12 +177,12 @@ def command(
         console.print(told_of_poses, soft_wrap=True)
     with bars() as report:
         summary = take(recording, trajectory, out, settings, report=report)
-    _tell(console, out, summary)
+    _print_summary(console, out, summary)
 
 
-def _topics(told: list[str]) -> dict[str, str]:
+def _topics(pairs: list[str]) -> dict[str, str]:
     topics = {}
-    for text in told:
+    for text in pairs:
         role, equals, name = text.partition("=")
         if not equals or not name:
             raise DatasetError(f"topic: {text!r} is not ROLE=NAME, such as scan=/points", field="topic")
@@ -233,12 +233,12 @@ def _single_frames(source: Path, out: Path, depth: str) -> None:
         console.print(f"left out because they have no depth: {', '.join(summary.skipped)}")
 
 
-def _tell(console: Console, out: Path, summary: TakeSummary) -> None:
+def _print_summary(console: Console, out: Path, summary: TakeSummary) -> None:
     held = f" ({summary.held_out} held out)" if summary.held_out else ""
     console.print(f"{out}: {summary.scans} scans{held}, {summary.pictures} image pairs", soft_wrap=True)
-    told = f"corrected for the vehicle's motion: {summary.deskewed} of {summary.scans + summary.held_out} scans"
+    text = f"corrected for the vehicle's motion: {summary.deskewed} of {summary.scans + summary.held_out} scans"
     console.print(
-        told + ("" if summary.deskewed else ", because their points have no times or --no-deskew was given"),
+        text + ("" if summary.deskewed else ", because their points have no times or --no-deskew was given"),
         soft_wrap=True,
     )
     if summary.points_without_numbers:

@@ -22,7 +22,7 @@ from service.client import Client, GrpcClient
 from service.client.tls import ClientTls
 from service.errors import RequestError, UnreachableError
 
-LATE_MS = 10.0  # a generator that is later than that to send, at p99, is told of
+LATE_MS = 10.0  # at p99; a report names a generator that sends later than this
 
 
 def command(

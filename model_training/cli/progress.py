@@ -195,17 +195,17 @@ def lines(write: Callable[[str], None], *, every_s: float = EVERY_S) -> Iterator
         write: function that writes a line.
         every_s: time between two lines of a running stage, seconds.
     """
-    told, ended = Lines(write, every_s=every_s), threading.Event()
+    shown, ended = Lines(write, every_s=every_s), threading.Event()
 
     def watch() -> None:
         while not ended.wait(every_s):
-            told.tick()
+            shown.tick()
 
     watcher = threading.Thread(target=watch, name="progress", daemon=True)
     watcher.start()
     try:
-        yield told
-        told.close()
+        yield shown
+        shown.close()
     finally:
         ended.set()
         watcher.join()
@@ -222,8 +222,8 @@ def bars() -> Iterator[Report]:
     """Provide one bar per reported stage, or lines if stderr is not a terminal that can draw bars."""
     console = Console(stderr=True)
     if not console.is_terminal or console.is_dumb_terminal:
-        with lines(_to_stderr) as told:
-            yield told
+        with lines(_to_stderr) as shown:
+            yield shown
         return
     columns = (
         TextColumn("{task.description:24}"),

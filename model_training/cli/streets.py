@@ -83,7 +83,7 @@ def command(
             picture.write_bytes(picture_png(written, places))
         except OSError as error:
             raise DatasetError(f"{picture}: cannot be written: {error.strerror or error}", field="picture") from error
-    for line in _told(read, collection, written, places):
+    for line in _summary(read, collection, written, places):
         Console(soft_wrap=True, highlight=False).print(line, markup=False)
 
 
@@ -118,7 +118,9 @@ def _read(
     return read_opendrive(source, lanes=lanes, frame=on_earth)
 
 
-def _told(read: StreetSource, collection: StreetCollection, written: Streets, places: NDArray[np.float64]) -> list[str]:
+def _summary(
+    read: StreetSource, collection: StreetCollection, written: Streets, places: NDArray[np.float64]
+) -> list[str]:
     names = {feature.street for feature in written.features}
     sections = sum(feature.section is not None or feature.name != feature.street for feature in written.features)
     inside = sum(written.index_at(place) >= 0 for place in places)

@@ -50,22 +50,24 @@ class Comparison:
         significantly fewer wrong accepted answers, and not significantly fewer right ones. The same holds for worse, the other way round.
         """
         right, wrong = self.shares["within_1_m"], self.shares["accepted_but_wrong"]
-        told = f"{_told(right, 'accepted and within 1 m')}; {_told(wrong, 'accepted and wrong')}"
+        differences = (
+            f"{_difference_text(right, 'accepted and within 1 m')}; {_difference_text(wrong, 'accepted and wrong')}"
+        )
         won, lost = _surely_more(right), _surely_less(right)
         safer, riskier = _surely_less(wrong), _surely_more(wrong)
         if (won and wrong.difference <= 0) or (safer and not lost):
-            return f"B is significantly better than A: {told}."
+            return f"B is significantly better than A: {differences}."
         if (lost and wrong.difference >= 0) or (riskier and not won):
-            return f"B is significantly worse than A: {told}."
+            return f"B is significantly worse than A: {differences}."
         if won or lost:
             more, fewer = ("B", "A") if won else ("A", "B")
-            return f"Neither is better: {more} has more right answers, {fewer} accepts fewer wrong ones: {told}."
+            return f"Neither is better: {more} has more right answers, {fewer} accepts fewer wrong ones: {differences}."
         if right.only_first + right.only_second + wrong.only_first + wrong.only_second == 0:
             return (
                 f"No difference: A and B are right about the same queries ({right.count}, {right.second:.1%} within 1 m), "
                 "and accept the same wrong ones."
             )
-        return f"No significant difference: {told}."
+        return f"No significant difference: {differences}."
 
     def as_json(self) -> dict[str, Any]:
         """Return all figures as JSON values."""
@@ -87,7 +89,7 @@ def _surely_less(each: PairedShares) -> bool:
     return each.p < _P and each.difference < 0
 
 
-def _told(each: PairedShares, what: str) -> str:
+def _difference_text(each: PairedShares, what: str) -> str:
     low, high = (f"{100 * side:+.1f}" for side in each.interval)
     return (
         f"{what}: {each.first:.1%} of A, {each.second:.1%} of B, {each.only_second} of {each.count} queries by B alone, "

@@ -106,8 +106,8 @@ def out_of_range(calibration: Calibration, evidence: NDArray[np.float64]) -> lis
         ]
     found = []
     for reason in reasons_of(calibration, np.median(known, axis=0)):
-        told = ", ".join(f"{name} {size:+.1f}" for name, size in reason.evidence)
-        what = f"{reason.check} (standard deviations from the mean of the calibration data: {told})"
+        deviations = ", ".join(f"{name} {size:+.1f}" for name, size in reason.evidence)
+        what = f"{reason.check} (standard deviations from the mean of the calibration data: {deviations})"
         found.append(Cause(what, reason.remedy))
     return found
 

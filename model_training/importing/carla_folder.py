@@ -117,7 +117,7 @@ class CarlaFolder:
 
     Attributes:
         path: folder of the recording.
-        told: content of ``recording.json``.
+        recording: content of ``recording.json``.
         frames: names of the frames, in order.
         poses: T_map_vehicle at the frames.
         kind: name of the format.
@@ -125,7 +125,7 @@ class CarlaFolder:
     """
 
     path: Path
-    told: CarlaRecording
+    recording: CarlaRecording
     frames: tuple[str, ...]
     poses: Trajectory
     kind: str = "carla"
@@ -134,7 +134,7 @@ class CarlaFolder:
     @property
     def lidar(self) -> LidarSensor:
         """The LiDAR in our convention."""
-        lidar = self.told.lidar
+        lidar = self.recording.lidar
         return LidarSensor(
             name="carla",
             channels=lidar.channels,
@@ -147,12 +147,12 @@ class CarlaFolder:
     @property
     def notes(self) -> Notes:
         """Number of frames, and the town."""
-        town = f" of {self.told.town}" if self.told.town else ""
-        return Notes((f"{len(self.frames)} frames{town}",), {"path": self.path.name, "town": self.told.town})
+        town = f" of {self.recording.town}" if self.recording.town else ""
+        return Notes((f"{len(self.frames)} frames{town}",), {"path": self.path.name, "town": self.recording.town})
 
     def count(self) -> int:
         """Count one scan per frame, and one image per frame if there is a camera."""
-        return len(self.frames) * (2 if self.told.camera else 1)
+        return len(self.frames) * (2 if self.recording.camera else 1)
 
     def trajectory(self) -> Trajectory | None:
         """Return T_map_vehicle. The map frame is CARLA's world, mirrored to be right-handed, as in its OpenDRIVE file."""
@@ -171,8 +171,8 @@ class CarlaFolder:
                 yield Unusable("scan", scan.name, points)
             else:
                 yield RecordedScan(scan.name, float(stamp_s), points_from_carla(points))
-            if pictures and self.told.camera is not None:
-                yield self._picture(name, float(stamp_s), self.told.camera)
+            if pictures and self.recording.camera is not None:
+                yield self._picture(name, float(stamp_s), self.recording.camera)
 
     def _picture(self, name: str, stamp_s: float, camera: CarlaCamera) -> RecordedPicture | Unusable:
         rgb_path, depth_path = (self.path / kind / f"{name}.png" for kind in ("rgb", "depth"))
@@ -200,18 +200,18 @@ def open_carla(source: Path) -> CarlaFolder:
     Raises:
         DatasetError: ``recording.json`` or ``poses.csv`` is missing or broken.
     """
-    told = source / "recording.json"
+    file = source / "recording.json"
     try:
-        recording = CarlaRecording.model_validate_json(told.read_bytes())
+        recording = CarlaRecording.model_validate_json(file.read_bytes())
     except OSError as error:
         raise DatasetError(
-            f"{told} cannot be read ({error}); it gives the mounting of the sensors, see docs/recordings.md",
-            field=told.name,
+            f"{file} cannot be read ({error}); it gives the mounting of the sensors, see docs/recordings.md",
+            field=file.name,
         ) from error
     except ValidationError as error:
         first = error.errors(include_url=False)[0]
         where = ".".join(str(part) for part in first["loc"])
-        raise DatasetError(f"{told}: {where}: {first['msg']}", field=where) from error
+        raise DatasetError(f"{file}: {where}: {first['msg']}", field=where) from error
     names, stamps, poses = _poses(source / "poses.csv")
     return CarlaFolder(source, recording, names, Trajectory(stamps, poses, str(source / "poses.csv")))
 

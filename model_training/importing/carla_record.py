@@ -117,7 +117,7 @@ def record(host: str, port: int, out: Path, settings: RecordSettings, *, report:
 
     done = 0
 
-    def told(frames: int, of: int) -> None:
+    def count(frames: int, of: int) -> None:
         nonlocal done
         done = frames
         report(frames, of)
@@ -125,7 +125,7 @@ def record(host: str, port: int, out: Path, settings: RecordSettings, *, report:
     client = carla.Client(host, port)
     client.set_timeout(settings.timeout_s)
     try:
-        return _recorded(carla, client, out, settings, told)
+        return _recorded(carla, client, out, settings, count)
     except RuntimeError as error:  # all errors of the client, time-outs included
         told_by = f"CARLA at {host}:{port} failed ({error})"
         remedy = (

@@ -57,10 +57,10 @@ def read_camera(path: Path) -> PinholeCamera:
     """
     try:
         loaded = json.loads(path.read_text())
-        told = loaded.get("camera", loaded)
-        numbers = {key: float(told[key]) for key in ("width", "height", "fx", "fy", "cx", "cy")}
-        distortion = tuple(float(x) for x in told.get("distortion", ()))
-        model: DistortionModel = told.get("distortion_model", "brown_conrady")
+        values = loaded.get("camera", loaded)
+        numbers = {key: float(values[key]) for key in ("width", "height", "fx", "fy", "cx", "cy")}
+        distortion = tuple(float(x) for x in values.get("distortion", ()))
+        model: DistortionModel = values.get("distortion_model", "brown_conrady")
     except (
         OSError,
         UnicodeDecodeError,

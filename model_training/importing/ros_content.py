@@ -93,11 +93,11 @@ def content_of(bag: BagReader, settings: BagSettings) -> BagContent:
     scan_frame = bag.first(topics.scan.name).header.frame_id.lstrip("/")
     remarks: list[str] = []
     tree, poses, vehicle = _poses(bag, topics, remarks)
-    told = settings.extrinsics.T_vehicle_lidar
+    T_given = settings.extrinsics.T_vehicle_lidar
     if topics.poses is not None and topics.poses.msgtype == _TF:
-        poses, vehicle = _poses_by_tf(bag.name, tree, scan_frame, told)
-    if told is not None:
-        T_vehicle_lidar = told
+        poses, vehicle = _poses_by_tf(bag.name, tree, scan_frame, T_given)
+    if T_given is not None:
+        T_vehicle_lidar = T_given
     elif vehicle:
         T_vehicle_lidar = _mounting(bag.name, tree, vehicle, scan_frame, "T_vehicle_lidar")
     else:
@@ -105,7 +105,7 @@ def content_of(bag: BagReader, settings: BagSettings) -> BagContent:
     camera = (
         _camera(bag, topics, settings, tree, vehicle, scan_frame, T_vehicle_lidar) if settings.want_pictures else None
     )
-    of = vehicle or ("the vehicle of --extrinsics" if told is not None else "the LiDAR")
+    of = vehicle or ("the vehicle of --extrinsics" if T_given is not None else "the LiDAR")
     assumed = "" if vehicle or poses is None else " (assumed: the topic does not say)"
     remarks.insert(0, f"poses are of: {of}{assumed}")
     return BagContent(topics, scan_frame, of, poses, T_vehicle_lidar, camera, tuple(remarks))

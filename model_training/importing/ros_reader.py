@@ -59,8 +59,8 @@ class BagReader:
 
     def topics(self) -> list[Topic]:
         """Return all topics that have exactly one type."""
-        told = self.reader.topics.items()
-        return [Topic(name, info.msgtype, info.msgcount) for name, info in told if info.msgtype is not None]
+        topics = self.reader.topics.items()
+        return [Topic(name, info.msgtype, info.msgcount) for name, info in topics if info.msgtype is not None]
 
     def messages(self, topics: Collection[str]) -> Iterator[Message | Damage]:
         """Yield the messages of some topics in the bag's order, and the damage between them.
@@ -79,7 +79,7 @@ class BagReader:
             except StopIteration:
                 return
             except Exception as error:
-                yield Damage("", f"reading stopped here ({_told(error)}); {_MEND}", is_end=True)
+                yield Damage("", f"reading stopped here ({_message_of(error)}); {_MEND}", is_end=True)
                 return
             try:
                 content = self.reader.deserialize(data, connection.msgtype)
@@ -125,7 +125,7 @@ def opened(path: Path) -> Iterator[BagReader]:
         reader.open()
     except Exception as error:  # as above: no common base class
         raise DatasetError(
-            f"{path}: cannot be opened as a ROS bag ({_told(error)}); {_MEND}", field="source"
+            f"{path}: cannot be opened as a ROS bag ({_message_of(error)}); {_MEND}", field="source"
         ) from error
     try:
         yield BagReader(path.name, reader)
@@ -133,5 +133,5 @@ def opened(path: Path) -> Iterator[BagReader]:
         reader.close()
 
 
-def _told(error: Exception) -> str:
+def _message_of(error: Exception) -> str:
     return " ".join(str(error).split())[:200] or type(error).__name__

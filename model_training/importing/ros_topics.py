@@ -72,19 +72,19 @@ class Topics:
         return tuple(lines)
 
 
-def topics_of(available: list[Topic], told: Mapping[str, str], *, source: str) -> Topics:
+def topics_of(available: list[Topic], given: Mapping[str, str], *, source: str) -> Topics:
     """Choose the topics of a bag.
 
     Args:
         available: all topics of the bag.
-        told: given topics by role; the others are guessed.
+        given: topics of the caller by role; the others are guessed.
         source: name of the bag, for errors.
 
     Raises:
         DatasetError: a role or topic is unknown or of another type, or there is no point cloud.
     """
     by_name = {topic.name: topic for topic in available}
-    for role, name in told.items():
+    for role, name in given.items():
         if role not in ROLES:
             raise DatasetError(f"topic: {role!r} is not a valid role; choose one of: {', '.join(ROLES)}", field="topic")
         if name not in by_name:
@@ -97,7 +97,7 @@ def topics_of(available: list[Topic], told: Mapping[str, str], *, source: str) -
                 f"{', '.join(_TYPES[role])}",
                 field="topic",
             )
-    chosen = {role: by_name[name] for role, name in told.items()}
+    chosen = {role: by_name[name] for role, name in given.items()}
     for role in ROLES:
         if role not in chosen and (topic := _guess(role, available, chosen)) is not None:
             chosen[role] = topic
@@ -112,7 +112,7 @@ def topics_of(available: list[Topic], told: Mapping[str, str], *, source: str) -
         depth=chosen.get("depth"),
         info=chosen.get("info"),
         poses=chosen.get("poses"),
-        guessed=tuple(role for role in ROLES if role not in told),
+        guessed=tuple(role for role in ROLES if role not in given),
     )
 
 

@@ -55,9 +55,9 @@ def payloads(
     """
     names = dataset.query_sets(with_truth=True) or dataset.query_sets()
     if not names or queries not in (None, *dataset.query_sets()):
-        there = ", ".join(dataset.query_sets()) or "none"
+        known = ", ".join(dataset.query_sets()) or "none"
         raise DatasetError(
-            f"{dataset.folder}: query set {queries or '(any)'} not found; the dataset has: {there}", field="queries"
+            f"{dataset.folder}: query set {queries or '(any)'} not found; the dataset has: {known}", field="queries"
         )
     frames = list(dataset.queries(queries or names[0]))
     if not frames:

@@ -82,13 +82,13 @@ def aligned(dataset: Dataset, poses: Poses, kept: NDArray[np.int64], *, report: 
     now = poses[kept].copy()
     for done in range(ROUNDS):
         # A function, so that the map of a round is gone before the next one is built.
-        _align_once(scans, now, poses[kept], partial(_told, report, len(kept) * (1 + done), steps))
+        _align_once(scans, now, poses[kept], partial(_report_step, report, len(kept) * (1 + done), steps))
     owner = np.clip(np.searchsorted(kept, np.arange(len(poses)), side="right") - 1, 0, len(kept) - 1)
     moved: Poses = (now @ np.linalg.inv(poses[kept]))[owner] @ poses
     return moved
 
 
-def _told(report: Report, before: int, steps: int, done: int) -> None:
+def _report_step(report: Report, before: int, steps: int, done: int) -> None:
     report("survey", before + done, steps)
 
 

@@ -37,7 +37,7 @@ def build_tiled(
     workers: int | None = None,
     overwrite: bool = False,
     report: Report = lambda *_: None,
-    tell: Callable[[str], None] = lambda _: None,
+    warn: Callable[[str], None] = lambda _: None,
 ) -> Manifest:
     """Build a tiled map, or continue a killed build; return the manifest.
 
@@ -54,7 +54,7 @@ def build_tiled(
         workers: number of tiles at the same time; None takes as many as cores and memory allow.
         overwrite: replace an existing map.
         report: progress callback.
-        tell: called with a line of text if a process dies.
+        warn: called with a line of text if a process dies.
 
     Raises:
         DatasetError: the survey is empty or damaged, or ``tile_m``, ``workers`` or the name is not valid.
@@ -71,8 +71,8 @@ def build_tiled(
         tasks = _tasks(dataset, encoder, encoder_file, settings, tile_m, work, report)
         _remove_others(work, tasks)
         left = [task for task in tasks if not task.is_finished]
-        told = _Progress(tasks, left, report)
-        run(engine, left, workers=workers, told=told, tell=tell)
+        progress = _Progress(tasks, left, report)
+        run(engine, left, workers=workers, on_progress=progress, warn=warn)
         if unseen := [task.name for task in left if not task.is_finished]:
             raise BundleError(
                 f"{unseen[0]}: the finished tile is not in {work.folder}; put --out on a folder that all machines share",

@@ -128,13 +128,13 @@ def _streets(a: MapBundle, b: MapBundle) -> dict[str, list[str]]:
 def _parameters(a: MapBundle, b: MapBundle) -> dict[str, list[Any]]:
     """Return both values of each parameter that differs, by its name."""
 
-    def told(bundle: MapBundle) -> dict[str, Any]:
+    def parameters_of(bundle: MapBundle) -> dict[str, Any]:
         manifest: dict[str, Any] = bundle.manifest.model_dump(mode="json")
         grid = {f"grid.{name}": value for name, value in manifest["grid"].items()}
         same = {name: manifest[name] for name in _SAME}
         return {**manifest["parameters"], **grid, **same, "rows_seen": sum(manifest["rows_seen"])}
 
-    old, new = told(a), told(b)
+    old, new = parameters_of(a), parameters_of(b)
     return {
         name: [old.get(name), new.get(name)]
         for name in sorted(old.keys() | new.keys())

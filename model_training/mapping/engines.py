@@ -37,7 +37,7 @@ LOCAL_ATTEMPTS, RAY_ATTEMPTS = 2, 4
 _EVERY_S = 0.5
 
 #: Progress callback: index of a task, and its finished share, 0 to 1.
-Told = Callable[[int, float], None]
+OnProgress = Callable[[int, float], None]
 #: Error of a task that can be sent to another process: class, message, field. A class that is no error of Streetfix has a traceback as its
 #: message.
 Failure = tuple[str, str, str]
@@ -85,7 +85,12 @@ def usual_workers(tasks: Sequence[TileTask]) -> int:
 
 
 def run(
-    engine: Engine, tasks: Sequence[TileTask], *, workers: int | None, told: Told, tell: Callable[[str], None]
+    engine: Engine,
+    tasks: Sequence[TileTask],
+    *,
+    workers: int | None,
+    on_progress: OnProgress,
+    warn: Callable[[str], None],
 ) -> None:
     """Build all tiles.
 
@@ -93,8 +98,8 @@ def run(
         engine: ``local`` or ``ray``.
         tasks: the tiles.
         workers: number of processes; None takes ``usual_workers``, and on a cluster of Ray all of its cores.
-        told: called with the progress of each tile.
-        tell: called with a line of text if a process dies.
+        on_progress: called with the progress of each tile.
+        warn: called with a line of text if a process dies.
 
     Raises:
         StreetfixError: a tile cannot be built.
@@ -105,17 +110,17 @@ def run(
     # The longest tile first, so that none of them runs alone at the end.
     order = sorted(range(len(tasks)), key=lambda index: -len(tasks[index].numbers))
     if engine == "local":
-        _run_local(tasks, order, workers or usual_workers(tasks), told, tell)
+        _run_local(tasks, order, workers or usual_workers(tasks), on_progress, warn)
     else:
-        _run_ray(tasks, order, workers, told, tell)
+        _run_ray(tasks, order, workers, on_progress, warn)
 
 
-def attempt(task: TileTask, told: Callable[[float], None]) -> Failure | None:
+def attempt(task: TileTask, on_progress: Callable[[float], None]) -> Failure | None:
     """Build a tile; return the error if it cannot be built.
 
     Args:
         task: the tile.
-        told: called with the finished share, at most twice per second.
+        on_progress: called with the finished share, at most twice per second.
     """
     last_s = -_EVERY_S
 
@@ -123,7 +128,7 @@ def attempt(task: TileTask, told: Callable[[float], None]) -> Failure | None:
         nonlocal last_s
         if time.monotonic() - last_s >= _EVERY_S:
             last_s = time.monotonic()
-            told(finished)
+            on_progress(finished)
 
     keep_little(THREADS, mapped_bytes=_MAPPED_BYTES)
     try:
@@ -150,11 +155,11 @@ _LESS_MEMORY = (
 )
 
 
-def _died(task: TileTask, how: str, attempts: int, most: int, tell: Callable[[str], None]) -> None:
+def _died(task: TileTask, how: str, attempts: int, most: int, warn: Callable[[str], None]) -> None:
     """Report a process that died; raise if the tile has no attempt left."""
     if attempts >= most:
         raise BundleError(f"{task.name}: its process {how} in each of {most} attempts; {_LESS_MEMORY}", field="workers")
-    tell(f"{task.name}: its process {how}; the tile goes on in another process")
+    warn(f"{task.name}: its process {how}; the tile goes on in another process")
 
 
 # -- processes of this machine ------------------------------------------------------------------------------------------------------------
@@ -171,7 +176,7 @@ class _Running:
 
 
 def _run_local(
-    tasks: Sequence[TileTask], order: Sequence[int], workers: int, told: Told, tell: Callable[[str], None]
+    tasks: Sequence[TileTask], order: Sequence[int], workers: int, on_progress: OnProgress, warn: Callable[[str], None]
 ) -> None:
     """Build each tile in a process of its own, so that its memory is free afterwards."""
     waiting = deque((index, 1) for index in order)
@@ -191,7 +196,7 @@ def _run_local(
                     failure = "died"
                 else:
                     if isinstance(message, float):
-                        told(each.index, message)
+                        on_progress(each.index, message)
                         continue
                     failure = message[0]
                 each.process.join()
@@ -199,12 +204,12 @@ def _run_local(
                 running.remove(each)
                 if failure == "died":
                     how = _how(each.process.exitcode)
-                    _died(tasks[each.index], how, each.attempts, LOCAL_ATTEMPTS, tell)
+                    _died(tasks[each.index], how, each.attempts, LOCAL_ATTEMPTS, warn)
                     waiting.appendleft((each.index, each.attempts + 1))
                 elif failure is not None:
                     _raise(tasks[each.index], failure)
                 else:
-                    told(each.index, 1.0)
+                    on_progress(each.index, 1.0)
     finally:
         for each in running:
             each.process.kill()  # a part is complete or absent, so nothing is left half
@@ -215,11 +220,11 @@ def _run_local(
 
 def _started(tasks: Sequence[TileTask], index: int, attempts: int) -> _Running:
     context = multiprocessing.get_context("spawn")
-    here, there = context.Pipe(duplex=False)
-    process = context.Process(target=_in_process, args=(there, tasks[index]), name=tasks[index].name, daemon=True)
+    receiver, sender = context.Pipe(duplex=False)
+    process = context.Process(target=_in_process, args=(sender, tasks[index]), name=tasks[index].name, daemon=True)
     process.start()
-    there.close()  # so that the end of the process closes the pipe
-    return _Running(index, attempts, process, here)
+    sender.close()  # so that the end of the process closes the pipe
+    return _Running(index, attempts, process, receiver)
 
 
 def _in_process(pipe: Connection, task: TileTask) -> None:
@@ -282,7 +287,11 @@ def _in_task(board: Any, index: int, task: TileTask) -> Failure | None:
 
 
 def _run_ray(
-    tasks: Sequence[TileTask], order: Sequence[int], workers: int | None, told: Told, tell: Callable[[str], None]
+    tasks: Sequence[TileTask],
+    order: Sequence[int],
+    workers: int | None,
+    on_progress: OnProgress,
+    warn: Callable[[str], None],
 ) -> None:
     """Build each tile as a task of Ray: on the cluster that ``RAY_ADDRESS`` names, else on this machine."""
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # Ray would send statistics to its vendor
@@ -317,19 +326,19 @@ def _run_ray(
             ready, _ = ray.wait(list(pending), timeout=_EVERY_S)
             with suppress(RayActorError):  # the actor's machine is lost; the tiles still report their end
                 for index, share in ray.get(board.take.remote()).items():
-                    told(index, share)
+                    on_progress(index, share)
             for done in ready:
                 index, attempts = pending.pop(done)
                 try:
                     failure = ray.get(done)
                 except (WorkerCrashedError, NodeDiedError, OutOfMemoryError) as error:
                     how = f"was lost ({type(error).__name__})"
-                    _died(tasks[index], how, attempts, RAY_ATTEMPTS, tell)
+                    _died(tasks[index], how, attempts, RAY_ATTEMPTS, warn)
                     waiting.appendleft((index, attempts + 1))
                     continue
                 if failure is not None:
                     _raise(tasks[index], failure)
-                told(index, 1.0)
+                on_progress(index, 1.0)
     finally:
         for each in pending:
             ray.cancel(each, force=True)

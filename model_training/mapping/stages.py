@@ -74,9 +74,9 @@ class ResumedStages:
             empty: an empty voxel map, whose lattice the points are gathered in.
             apart: indices of the kept scans whose points stay out of the voxel map.
         """
-        told = partial(self._told, "places")
-        make = partial(drive.chunk, empty=empty, apart=apart, report=told)
-        return gathered(self.work.chunks("places", len(self.kept), make, told), empty)
+        report = partial(self._report_stage, "places")
+        make = partial(drive.chunk, empty=empty, apart=apart, report=report)
+        return gathered(self.work.chunks("places", len(self.kept), make, report), empty)
 
     def dynamic_voxels(
         self, cloud: VoxelMap, poses: NDArray[np.float64], *, each_scan: bool, earlier: NDArray[np.int64] | None = None
@@ -91,8 +91,8 @@ class ResumedStages:
         """
         vote = Vote.of(cloud, self.dataset, poses, self.kept, self.settings, each_scan=each_scan, part=self.part)
         name, stage = ("traffic", "traffic") if each_scan else ("votes", "passes")
-        told = partial(self._told, stage)
-        return vote.removed(self.work.chunks(name, len(self.kept), partial(vote.votes, report=told), told), earlier)
+        report = partial(self._report_stage, stage)
+        return vote.removed(self.work.chunks(name, len(self.kept), partial(vote.votes, report=report), report), earlier)
 
     def site(self, calibration: Calibration, check: Callable[[], Site]) -> Site:
         """Return the result of the site check.
@@ -108,5 +108,5 @@ class ResumedStages:
         name = f"site-{sha256(calibration.model_dump_json().encode()).hexdigest()[:16]}"
         return Site.model_validate_json(self.work.part(name, made)["site"].tobytes())
 
-    def _told(self, stage: str, done: int) -> None:
+    def _report_stage(self, stage: str, done: int) -> None:
         self.report(stage, done, len(self.kept))

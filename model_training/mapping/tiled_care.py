@@ -33,7 +33,7 @@ def tiles_of(read: Manifest) -> dict[Square, Tile]:
 def diff_of_tiles(before: Path, after: Path, *, report: Report = lambda *_: None) -> dict[str, Any]:
     """Return the changes from one tiled map to another as JSON values.
 
-    Only tiles of two versions are opened. ``changed`` has for each of them what ``diff_of`` says of a bundle.
+    Only tiles of two versions are opened. ``changed`` has for each of them the result of ``diff_of`` for a bundle.
 
     Args:
         before: folder of a tiled map.

@@ -104,7 +104,7 @@ def update_tiled(
             for part in tile_parts(poses, kept, tile_m=tile_m, between_m=settings.between_m, also=tiles)
             if len(part.order) or _has_any(old / tiles[_square(part)].folder, replacement.inside)
         ]
-        told = _Progress(changed, report)
+        progress = _Progress(changed, report)
         for part in changed:
             own, numbers = tiles.get(_square(part)), kept[part.order]
             tile = _Tile(
@@ -118,8 +118,8 @@ def update_tiled(
                 streets,
                 threads,
             )
-            folders[_square(part)] = tile.updated(work.folder, told)
-            told.finished(part)
+            folders[_square(part)] = tile.updated(work.folder, progress)
+            progress.finished(part)
         left = {square: folder for square, folder in folders.items() if folder is not None}
         rig = None if whole.calibration is None else whole.calibration.rig
         report("joining tiles", 0, 1)

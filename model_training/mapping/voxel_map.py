@@ -381,8 +381,8 @@ class VoxelMap:
         return surfels, brightness
 
     def _brightness_of(self, rows: NDArray[np.int32]) -> NDArray[np.float32]:
-        bright, told = (self._moments[rows, column] for column in (_BRIGHT.start, _BRIGHT.start + 1))
-        mean: NDArray[np.float32] = np.divide(bright, told, out=np.full(len(rows), np.nan, np.float32), where=told > 0)
+        total, count = (self._moments[rows, column] for column in (_BRIGHT.start, _BRIGHT.start + 1))
+        mean: NDArray[np.float32] = np.divide(total, count, out=np.full(len(rows), np.nan, np.float32), where=count > 0)
         return mean
 
 

@@ -36,17 +36,17 @@ _STYLE: Mapping[str, Any] = {
 }
 
 
-def chart(title: str, told: str, draw: Callable[[Axes], None], *, legend: bool = False) -> str:
+def chart(title: str, alt_text: str, draw: Callable[[Axes], None], *, legend: bool = False) -> str:
     """Draw a chart and return it as an HTML image. The same data give the same bytes.
 
     Args:
         title: title of the chart.
-        told: content in words, for screen readers.
+        alt_text: content in words, for screen readers.
         draw: function that draws on the axes.
         legend: whether to add a legend of the labelled series below the axes.
     """
     svg = base64.b64encode(picture(title, draw, legend=legend)).decode()
-    return f'<img class="plot" src="data:image/svg+xml;base64,{svg}" alt="{escape(f"{title}: {told}")}">'
+    return f'<img class="plot" src="data:image/svg+xml;base64,{svg}" alt="{escape(f"{title}: {alt_text}")}">'
 
 
 def picture(title: str, draw: Callable[[Axes], None], *, legend: bool = False, form: str = "svg") -> bytes:

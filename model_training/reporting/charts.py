@@ -39,7 +39,7 @@ def error_curve(runs: Mapping[str, Predictions]) -> str:
     """
     reach = np.geomspace(_NEAR_M, _FAR_M, 90)
     first = next(iter(runs.values()))
-    told = "; ".join(
+    alt_text = "; ".join(
         f"{share:.1%} within {m:g} m" for m, share in zip((0.5, 1, 5), _share_within(first, [0.5, 1, 5]), strict=True)
     )
 
@@ -49,7 +49,7 @@ def error_curve(runs: Mapping[str, Predictions]) -> str:
         _metres_across(axes)
         shares_up(axes, "share of queries, %")
 
-    return chart("Share of queries within a distance", told, draw, legend=len(runs) > 1)
+    return chart("Share of queries within a distance", alt_text, draw, legend=len(runs) > 1)
 
 
 def _metres_across(axes: Axes) -> None:
@@ -73,7 +73,7 @@ def error_histogram(p: Predictions) -> str:
     errors = position_errors(p)
     edges = np.geomspace(_NEAR_M, _FAR_M, 46)
     counts, _ = np.histogram(np.clip(errors[np.isfinite(errors)], edges[0], edges[-1]), edges)
-    told = f"{int(np.isfinite(errors).sum())} answers; half of them within {_median(errors):.2f} m"
+    alt_text = f"{int(np.isfinite(errors).sum())} answers; half of them within {_median(errors):.2f} m"
 
     def draw(axes: Axes) -> None:
         axes.stairs(counts, edges, fill=True, color=SERIES[1])
@@ -81,7 +81,7 @@ def error_histogram(p: Predictions) -> str:
         axes.set(ylim=(0.0, 1.05 * max(1, int(counts.max()))), ylabel="queries")
         axes.yaxis.set_major_locator(MaxNLocator("auto", integer=True))
 
-    return chart("Answers by distance from the truth", told, draw)
+    return chart("Answers by distance from the truth", alt_text, draw)
 
 
 def _median(errors: NDArray[np.float64]) -> float:
@@ -98,7 +98,7 @@ def recall_curves(runs: Mapping[str, Predictions]) -> str:
     k = np.arange(1, RANKED + 1)
     recalls = {name: [recall_at(p.ranked_xy, p.T_true[:, :2, 3], int(n)).mean() for n in k] for name, p in runs.items()}
     first = next(iter(recalls.values()))
-    told = f"{first[0]:.1%} at one place, {first[4]:.1%} at five, {first[-1]:.1%} at ten"
+    alt_text = f"{first[0]:.1%} at one place, {first[4]:.1%} at five, {first[-1]:.1%} at ten"
 
     def draw(axes: Axes) -> None:
         for name, recall in recalls.items():
@@ -106,7 +106,7 @@ def recall_curves(runs: Mapping[str, Predictions]) -> str:
         axes.set(xlim=(1, RANKED), xticks=k, xlabel="number of most similar places")
         shares_up(axes, "share of queries, %")
 
-    return chart("Recall at 5 m", told, draw, legend=len(runs) > 1)
+    return chart("Recall at 5 m", alt_text, draw, legend=len(runs) > 1)
 
 
 def reliability(p: Predictions) -> tuple[str, float] | None:
@@ -127,7 +127,7 @@ def reliability(p: Predictions) -> tuple[str, float] | None:
             points.append([confidence[chosen].mean(), right[chosen].mean()])
             intervals.append(wilson_interval(int(right[chosen].sum()), int(chosen.sum())))
             gap += abs(points[-1][0] - points[-1][1]) * chosen.mean()
-    told = "; ".join(f"of confidence {c:.2f}: {share:.0%} right" for c, share in points)
+    alt_text = "; ".join(f"of confidence {c:.2f}: {share:.0%} right" for c, share in points)
 
     def draw(axes: Axes) -> None:
         axes.axline((0, 0), (1, 1), color=SERIES[0], linewidth=1, linestyle="--")
@@ -135,7 +135,7 @@ def reliability(p: Predictions) -> tuple[str, float] | None:
         axes.set(xlim=(0.0, 1.0), xlabel="confidence")
         shares_up(axes, "within 1 m, %")
 
-    return chart("Confidence against truth", told, draw), float(gap)
+    return chart("Confidence against truth", alt_text, draw), float(gap)
 
 
 def _dots(axes: Axes, points: NDArray[np.float64], intervals: NDArray[np.float64]) -> None:
@@ -153,11 +153,11 @@ def side_by_side(shares: Mapping[str, tuple[float, float, float]], label: str) -
     """
     values = np.array(list(shares.values()))
     number = np.arange(1, len(shares) + 1)
-    told = "; ".join(f"{name} {share:.1%} ({low:.1%} to {high:.1%})" for name, (share, low, high) in shares.items())
+    alt_text = "; ".join(f"{name} {share:.1%} ({low:.1%} to {high:.1%})" for name, (share, low, high) in shares.items())
 
     def draw(axes: Axes) -> None:
         _dots(axes, np.column_stack([number, values[:, 0]]), values[:, 1:])
         axes.set(xlim=(0.5, len(shares) + 0.5), xticks=number, xlabel="query set, in the table's order")
         shares_up(axes, f"{label}, %")
 
-    return chart(label, told, draw)
+    return chart(label, alt_text, draw)

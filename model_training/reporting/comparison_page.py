@@ -165,11 +165,11 @@ def _changed(
     )
     shown = []
     for name, number, row in locate(by_change[:_SHOWN], first.predictions):
-        told = "".join(
+        statuses = "".join(
             f'<br>{run}: <span class="tag">{escape(became[k][row])}</span> {_off(errors[k][row])}'
             for k, run in enumerate(("A", "B"))
         )
-        shown.append(Shown(name, number, row, f"<p>{told.removeprefix('<br>')}</p>"))
+        shown.append(Shown(name, number, row, f"<p>{statuses.removeprefix('<br>')}</p>"))
     more = f"<p>The page shows the {_SHOWN} queries that changed most.</p>" if len(rows) > _SHOWN else ""
     legend = (
         ""

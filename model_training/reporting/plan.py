@@ -82,7 +82,7 @@ class Plan:
         ]:  # the worst are drawn last, so that nothing hides them
             kind = class_of(errors[k])
             x, y = true_xy[k]
-            told = f"query {k}: {'no answer' if not np.isfinite(errors[k]) else f'{errors[k]:.2f} m'}"
+            tooltip = f"query {k}: {'no answer' if not np.isfinite(errors[k]) else f'{errors[k]:.2f} m'}"
             if ERRORS[2][0] < errors[k] < np.inf:
                 lines.append(_line(true_xy[k], answer_xy[k], "off"))
             mark = (
@@ -90,10 +90,10 @@ class Plan:
                 if errors[k] > ERRORS[2][0]
                 else f'<circle class="{kind}" cx="{x:.1f}" cy="{-y:.1f}" r="{unit:.2f}"/>'
             )
-            dots.append(f"<g>{mark}<title>{told}</title></g>")
+            dots.append(f"<g>{mark}<title>{tooltip}</title></g>")
         content = self._image() + "".join(lines) + "".join(dots)
-        told = "; ".join(f"{number} {name}" for name, number in counted(errors).items())
-        return _drawing("The map from above with all queries", told, content, view=self.view, kind="plan")
+        alt_text = "; ".join(f"{number} {name}" for name, number in counted(errors).items())
+        return _drawing("The map from above with all queries", alt_text, content, view=self.view, kind="plan")
 
     def around(
         self,
@@ -124,8 +124,10 @@ class Plan:
             parts.append(_line(true_xy, answers_xy[k], "off"))
             parts.append(_cross(answers_xy[k, 0], -answers_xy[k, 1], side / 28, f"answer{k}"))
         parts.append(f'<circle class="truth" cx="{true_xy[0]:.2f}" cy="{-true_xy[1]:.2f}" r="{side / 28:.2f}"/>')
-        told = f"{side * 4 / 3:.0f} m across"
-        return _drawing("True and estimated position of the query", told, "".join(parts), view=view, kind="small-plan")
+        alt_text = f"{side * 4 / 3:.0f} m across"
+        return _drawing(
+            "True and estimated position of the query", alt_text, "".join(parts), view=view, kind="small-plan"
+        )
 
     def _image(self) -> str:
         return f'<image id="{_GROUND_ID}" href="{self.picture}" {_box(self.view)}/>'
@@ -150,13 +152,15 @@ def counted(errors: NDArray[np.float64]) -> dict[str, int]:
     return {label: classes.count(name) for _, name, label in ERRORS}
 
 
-def _drawing(title: str, told: str, content: str, *, view: tuple[float, float, float, float], kind: str) -> str:
+def _drawing(title: str, alt_text: str, content: str, *, view: tuple[float, float, float, float], kind: str) -> str:
     """Return an SVG element with a description for screen readers.
 
     The drawings of a page share the map's image and the page's colours. So the page holds them as elements, not as images.
     """
     box = " ".join(f"{v:.2f}".rstrip("0").rstrip(".") for v in view)
-    return f'<svg class="{kind}" viewBox="{box}" role="img" aria-label="{escape(f"{title}: {told}")}">{content}</svg>'
+    return (
+        f'<svg class="{kind}" viewBox="{box}" role="img" aria-label="{escape(f"{title}: {alt_text}")}">{content}</svg>'
+    )
 
 
 def _box(view: tuple[float, float, float, float]) -> str:

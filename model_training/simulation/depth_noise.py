@@ -92,17 +92,17 @@ def measured_depth(
         whole: int = max(1, round(pixels * zoom))
         return whole
 
-    there = clean_m > 0
-    z = np.where(there, clean_m, np.float32(BEYOND_M))
+    is_surface = clean_m > 0
+    z = np.where(is_surface, clean_m, np.float32(BEYOND_M))
     if condition.extinction_per_m > 0:  # a contrast below 5 % gives no match (Koschmieder)
-        there &= np.exp(-condition.extinction_per_m * z) > 0.05
+        is_surface &= np.exp(-condition.extinction_per_m * z) > 0.05
     size = 2 * patch(2) + 1
     near = cv2.erode(z, np.ones((size, size), np.uint8))
     edge = (z - near) > np.maximum(0.5, 0.08 * near)
     mixing = np.float32(0.3 * rng.random())
     bleed = edge & (_unit(_field(rng, shape, patch(12), smooth=False)) > _level_of(model.bleeding))
     z = np.where(bleed, near * (1 - mixing) + np.minimum(z, np.float32(60)) * mixing, z)
-    measured = (there | bleed) & (z < 150)
+    measured = (is_surface | bleed) & (z < 150)
     noise = np.zeros(shape, np.float32)
     sigma = model.noise_px * condition.disparity_noise
     if sigma > 0:
@@ -124,7 +124,7 @@ def measured_depth(
     if rng.random() < model.invented_frames:
         made_up = np.exp(0.3 * _field(rng, shape, max(2, shape[0] // 5))) * np.float32(20)
         region = _field(rng, shape, max(2, shape[0] // 7)) > 0.3
-        invented = region & (~there | (blank & (_field(rng, shape, patch(40)) > 0.8)))
+        invented = region & (~is_surface | (blank & (_field(rng, shape, patch(40)) > 0.8)))
         seen, measured = np.where(invented, made_up, seen), measured | invented
     seen = seen * np.float32(1 + model.scale_error * rng.standard_normal())
     measured &= (seen > model.min_range_m) & (seen < model.max_range_m)

@@ -1,4 +1,4 @@
-"""A street of identical blocks with a landmark every few blocks. A single image cannot tell the blocks apart."""
+"""A street of identical blocks with a landmark every few blocks. A single image cannot distinguish the blocks."""
 
 import numpy as np
 from numpy.typing import NDArray

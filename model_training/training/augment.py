@@ -348,9 +348,9 @@ def brightness(values: Tensor, *, measured: Tensor, seen: Tensor) -> Tensor:
     logarithm = torch.log(values / level.clamp(min=1e-9) + BRIGHTNESS_FLOOR)
     middle = mean(logarithm)
     spread = mean((logarithm - middle) ** 2).sqrt()
-    told = seen & (level > 0) & (spread >= LEAST_BRIGHTNESS_SPREAD)
+    is_known = seen & (level > 0) & (spread >= LEAST_BRIGHTNESS_SPREAD)
     return torch.where(
-        told,
+        is_known,
         ((logarithm - middle) / spread.clamp(min=1e-6)).clamp(-BRIGHTNESS_LIMIT, BRIGHTNESS_LIMIT),
         torch.zeros_like(values),
     )

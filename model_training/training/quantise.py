@@ -133,6 +133,6 @@ def _in_eight_bits(encoder: Path, model: onnx.ModelProto, ranges: Iterable[Views
             op_types_to_quantize=list(QUANTISED),
         )
         found = onnx.load(whole)
-    told = {each.key: each.value for each in model.metadata_props}
-    onnx.helper.set_model_props(found, told | {"bits": "8"})
+    metadata = {each.key: each.value for each in model.metadata_props}
+    onnx.helper.set_model_props(found, metadata | {"bits": "8"})
     return bytes(found.SerializeToString())

@@ -395,7 +395,7 @@ def _hangup_held_back() -> Iterator[None]:
 def _watching(engine: "Engine", *, also: Callable[[], None]) -> Iterator[None]:
     """Look for new bundles inside the context, periodically and on SIGHUP.
 
-    SIGHUP asks the service to read external files again. The service itself never sends SIGHUP; workers share news about maps through
+    SIGHUP makes the service read external files again. The service itself never sends SIGHUP; workers share news about maps through
     the serving table.
 
     Args:

@@ -100,9 +100,9 @@ class ClientTls:
 
         shown, secret = named(cert, "cert", CERT), named(key, "key", KEY)
         if (shown is None) != (secret is None):
-            there, missing = ("cert", "key") if secret is None else ("key", "cert")
+            given, missing = ("cert", "key") if secret is None else ("key", "cert")
             raise RequestError(
-                f"{missing}: a client certificate and its private key belong together, but only {there} is given; pass --{missing}, "
+                f"{missing}: a client certificate and its private key belong together, but only {given} is given; pass --{missing}, "
                 f"{missing}= or {KEY if missing == 'key' else CERT} as well",
                 field=missing,
             )

@@ -98,8 +98,8 @@ class Evidence:
         Without this normalisation a sparse survey would get fewer votes (decision 0033).
         """
         xy = self.best.T_map_camera[:2, 3]
-        there = float(np.clip((np.hypot(*(self.places_m - xy).T) < VOTE_M).sum(), 1, VOTERS))
-        return float((self.away_m[:VOTERS] < VOTE_M).sum()) / there
+        places = float(np.clip((np.hypot(*(self.places_m - xy).T) < VOTE_M).sum(), 1, VOTERS))
+        return float((self.away_m[:VOTERS] < VOTE_M).sum()) / places
 
     @property
     def entropy(self) -> float:
@@ -245,7 +245,7 @@ def require_features(calibration: Calibration | None, path: str) -> None:
     """
     if calibration is not None and calibration.names != FEATURES:
         raise BundleError(
-            f"{path}: the confidence features are not those of this release ({', '.join(FEATURES)}); renew the calibration with "
+            f"{path}: the confidence features differ from those of this release ({', '.join(FEATURES)}); renew the calibration with "
             "`streetfix calibrate --map MAP --calibration stock`, or build the map again",
             field="calibration.json",
         )

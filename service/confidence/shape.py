@@ -1,4 +1,4 @@
-"""Statistics of a view that tell how distinctive its geometry is.
+"""Statistics of a view that measure how distinctive its geometry is.
 
 A bare wall constrains a pose less than a crossing, in any map.
 """

@@ -139,7 +139,7 @@ def check_distortion(camera: Camera) -> Finding:
         return Finding(
             "distortion",
             "ok",
-            "none given, so both images must be rectified; the command cannot tell",
+            "none given, so both images must be rectified; the command cannot check this",
             "hold a ruler against a straight roof edge, kerb or door frame near the border of an image: if it looks curved, send "
             "camera.distortion and camera.distortion_model",
         )

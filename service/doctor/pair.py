@@ -18,7 +18,7 @@ from service.imaging.picture_headers import DEFAULT_LIMITS
 from service.imaging.rectify import RectifiedPair, rectification_of, rectified_pair
 from service.runtime.engine import EncodedQuery
 
-#: Share of pixels with a depth below which the images tell little.
+#: Smallest share of pixels with depth. Below it, the images rarely suffice.
 LEAST_SHARE = 0.1
 
 Rgb = UInt8[NDArray[np.uint8], "H W 3"]

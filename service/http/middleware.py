@@ -25,7 +25,7 @@ from service.runtime.tracing import NO_SPAN, Tracing
 #: Status in metrics and log if the client disconnects before the answer, as nginx uses it.
 _CLIENT_CLOSED = 499
 
-#: Paths for an orchestrator, which has no key and asks under any name.
+#: Paths for an orchestrator. It has no key and uses any host name.
 _OPEN = frozenset({"/livez", "/readyz"})
 #: The page of the console is public and holds no map data. It requests its data with a key.
 _PAGE = "/console"

@@ -147,9 +147,9 @@ def _npy(data: bytes, limits: ImageLimits) -> Values:
     if len(shape) != 2 or min(shape) < 1:
         raise damaged(_FIELD, f"the NPY shape is {shape}, but depth needs (height, width)")
     require_pixels(shape[0], shape[1], limits, field=_FIELD)
-    needed, there = shape[0] * shape[1] * dtype.itemsize, len(data) - stream.tell()
-    if there != needed:
-        raise damaged(_FIELD, f"the NPY has {there} bytes of values, but its shape {shape} needs {needed}")
+    needed, stored = shape[0] * shape[1] * dtype.itemsize, len(data) - stream.tell()
+    if stored != needed:
+        raise damaged(_FIELD, f"the NPY has {stored} bytes of values, but its shape {shape} needs {needed}")
     values = np.frombuffer(data, dtype, offset=stream.tell()).reshape(shape, order="F" if is_fortran else "C")
     return values.astype(dtype.newbyteorder("="), copy=False)
 

@@ -1,6 +1,6 @@
 """Remove rain and snow from a LiDAR scan by the principal components of each point's neighbourhood.
 
-Reference 19 of the paper cleans point clouds by PCA and says no more. The rule that identifies noise is ours (2026-11).
+Reference 19 of the paper cleans point clouds by PCA and gives no details. The rule that identifies noise is ours (2026-11).
 
 - Drops and flakes are isolated in the air near the sensor. Few of the beams in their direction return from them. These returns
   lie on no line and no plane.
@@ -154,10 +154,10 @@ def _sums_around(
     keys = keys[order]
     result = np.zeros((len(wanted), values.shape[1]))
     for offset in offsets:
-        there = wanted + offset
-        there[:, 0] %= turn
-        inside = (there[:, 0] >= low[0]) & (there[:, 0] < low[0] + size[0])
-        key = _keys(there, low, size)
+        neighbour = wanted + offset
+        neighbour[:, 0] %= turn
+        inside = (neighbour[:, 0] >= low[0]) & (neighbour[:, 0] < low[0] + size[0])
+        key = _keys(neighbour, low, size)
         at = np.minimum(np.searchsorted(keys, key), len(keys) - 1)
         hit = inside & (keys[at] == key)
         result[hit] += values[order[at[hit]]]

@@ -1,4 +1,4 @@
-"""Agreement of frames: what each frame says alone, as a belief, and whether it confirms the pose of all frames together."""
+"""Agreement of frames: the belief after each frame alone, and whether it confirms the pose of all frames together."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -29,7 +29,7 @@ PREDICTED = 4
 def registered(register: Register, calibration: Calibration | None, frames: tuple[EncodedFrame, ...]) -> QueryResult:
     """Register all frames of a query together, and accept their pose if the frames agree about it one by one.
 
-    The confidence of the frames together falls short of the threshold where each frame has weak evidence. Whether they agree is other
+    The confidence of the frames together is below the threshold if each frame has weak evidence. Their agreement is independent
     evidence: a wrong pose of one frame is rarely at the place that the odometry predicts from the wrong pose of another (decision 0169).
 
     Args:
@@ -91,7 +91,7 @@ def agreed(calibration: Calibration, belief: Belief, false_accept_rate: float) -
 
 
 def updated_belief(calibration: Calibration | None, frame: EncodedFrame, alone: QueryResult, belief: Belief) -> Belief:
-    """Return the belief after a frame. A frame outside the range of the calibration says nothing at the default false-accept rate.
+    """Return the belief after a frame. At the default false-accept rate, a frame outside the range of the calibration is no evidence.
 
     Args:
         calibration: of the map.

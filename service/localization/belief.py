@@ -60,7 +60,7 @@ class FrameCandidate:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Sighting:
-    """What one frame says alone.
+    """Probabilities after one frame alone.
 
     Attributes:
         candidates: poses that exclude each other.
@@ -133,7 +133,7 @@ class Belief:
         """Return the belief after a frame.
 
         Args:
-            sighting: what the frame says alone.
+            sighting: probabilities after the frame alone.
             alternatives: number of places that wrong candidates of consecutive frames are spread over.
         """
         partner = _pairs(self.modes, sighting.candidates)
@@ -197,7 +197,7 @@ class Belief:
         return _normalised([raised, *others], scale * self.elsewhere, scale * self.outside, born)
 
     def unseen(self) -> "Belief":
-        """Return the belief after a frame that says nothing, for example because a vehicle covers it."""
+        """Return the belief after a frame without evidence, for example because a vehicle covers the view."""
         return replace(self, modes=tuple(replace(mode, unseen=mode.unseen + 1) for mode in self.modes))
 
 
@@ -207,7 +207,7 @@ def sighting_of(
     """Distribute the probability of one frame over its candidates, the rest of the map, and the outside.
 
     The first candidate has the calibrated confidence. If it does not hold the majority of the support, it has at most its share, because
-    then look-alikes compete with it. The others have the rest in proportion to their shares (as ``confidence.spread.spread_of``).
+    then perceptual aliases compete with it. The others have the rest in proportion to their shares (as ``confidence.spread.spread_of``).
 
     Args:
         candidates: poses that exclude each other, the best supported first; their ``probability`` is not read.

@@ -52,7 +52,7 @@ def follow(
     """Answer the next frame of a robot.
 
     1. The frame is registered alone. The modes of the belief are starts too.
-    2. The belief moves by the odometry, and takes what the frame says.
+    2. The odometry moves the belief. The frame updates it.
     3. If another mode overtakes the one that the robot was at, the robot was displaced. The frames before no longer count.
     4. The answer comes from the frame alone, from the last frames together, or from the belief: the first that is LOCALIZED and that
        nothing contradicts. If it is at another mode than the last LOCALIZED answer, the epoch rises.

@@ -203,7 +203,7 @@ class ScannedCopy:
         if copy.ntotal != views or copy.d != dimension or codes.ntotal != views or codes.d != axes.d_out:
             raise _defect(path, f"{copy.ntotal} views of {copy.d} numbers instead of {views} of {dimension}")
         if codes.codes.size() != views * codes.code_size:
-            raise _defect(path, "the codes are not those of all views")
+            raise _defect(path, "the number of codes differs from the number of views")
         return cls(copy, _mean_of(axes))
 
     def shortlist(self, descriptor: Float32[NDArray[np.float32], " D"], k: int) -> Int64[NDArray[np.int64], " k"]:

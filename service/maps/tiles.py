@@ -1,7 +1,7 @@
 """A tiled map: a bundle for each square of the ground. A query opens the few tiles that it needs.
 
-The search index of the whole map says which tiles resemble a query. A prior, or the poses that are registered, name tiles too. Their parts
-together behave like a map of one bundle.
+The search index of the whole map finds the tiles that resemble a query. A prior, or the poses that are registered, name tiles too.
+Their parts together behave like a map of one bundle.
 """
 
 import threading
@@ -60,7 +60,7 @@ class TileSource(Protocol):
         """
 
     def expect(self, tiles: Sequence[Tile]) -> None:
-        """Prepare for tiles that will probably be asked for soon, without waiting.
+        """Prepare tiles that requests will probably need soon, without waiting.
 
         Args:
             tiles: the most probable first. They replace those of the call before.
@@ -590,4 +590,4 @@ def _require_consistent(opened: TiledMap) -> None:
     if opened.place_street.min() < -1 or opened.place_street.max() >= named:
         raise defect(path / parts.PLACES_FILE, "a place refers to a missing street")
     if counts.views != counts.places * opened.manifest.headings:
-        raise defect(path / manifest.FILE, "the number of views is not that of all headings of all places")
+        raise defect(path / manifest.FILE, "the number of views differs from places times headings")

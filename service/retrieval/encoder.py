@@ -125,9 +125,9 @@ def require_provider(provider: Provider) -> None:
     Raises:
         EncoderError: the provider is not installed. The error names the installed ones.
     """
-    there = onnxruntime.get_available_providers()
-    if _PROVIDERS[provider] not in there:
-        known = ", ".join(name for name, full in _PROVIDERS.items() if full in there)
+    available = onnxruntime.get_available_providers()
+    if _PROVIDERS[provider] not in available:
+        known = ", ".join(name for name, full in _PROVIDERS.items() if full in available)
         raise EncoderError(
             f"provider: ONNX Runtime lacks {provider!r} (available: {known}); install {_PACKAGES[provider]} instead of "
             "onnxruntime, or choose another provider",

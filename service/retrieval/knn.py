@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from service.maps.map import Map
 
-#: Length of the shortlist, as a multiple of the number of views wanted. Decision 0046 says what a shorter list loses.
+#: Length of the shortlist, as a multiple of the number of views wanted. Decision 0046 has the loss of a shorter list.
 SHORTLIST = 6
 
 

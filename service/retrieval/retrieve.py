@@ -154,7 +154,7 @@ def turns_on(grid: ViewGrid) -> tuple[int, ...]:
 def near_prior(query: Query) -> tuple[Float64[NDArray[np.float64], "2"], float] | None:
     """Return x and y (m, map frame) and radius (m) of the area where the prior of a query expects the camera; None without a position.
 
-    A tiled map is searched there. The area is generous, so a prior that is worse than it says still finds its tile.
+    A tiled map is searched there. The area is generous, so a prior with a larger error than stated still finds its tile.
 
     Args:
         query: query with its options.

@@ -185,9 +185,9 @@ class ServingTable:
                     f"map {name[:100]!r} not found; mounted maps: {', '.join(table.maps) or 'none'}", field="map"
                 )
             if not table.is_mounted((name, version)):
-                there = ", ".join(each.version for each in known.versions)
+                mounted = ", ".join(each.version for each in known.versions)
                 raise UnknownMapError(
-                    f"version {version!r} of {name!r} not found; mounted versions: {there}", field="version"
+                    f"version {version!r} of {name!r} not found; mounted versions: {mounted}", field="version"
                 )
             return replace(table, maps={**table.maps, name: replace(known, serving=version)})
 

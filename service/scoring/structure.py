@@ -1,6 +1,6 @@
 """Score poses by depth structure: depth edges, surfaces above traffic, and how well a shifted image of the map would fit.
 
-The share of inliers tells little about a street: ground and a wall on each side fit at many places. The depth edges of poles, trunks,
+The share of inliers does not identify a street: ground and a wall on each side fit at many places. The depth edges of poles, trunks,
 corners and eaves fit at the right place only. So does the fit itself: at a right pose it becomes worse if the map's image shifts by a few
 degrees. Right and wrong answers have about the same numbers in simulated cities and on KITTI drive 0005 (decision 0159). Between rigs the
 numbers differ: noisy depth has less contrast, and a narrow view has fewer edges.
@@ -283,9 +283,9 @@ def shared_edges(one: DepthEdges, other: DepthEdges) -> float:
         other: edges of another image.
     """
     both = one.known & other.known
-    here, there = one.rising & both, other.rising & both
-    shared = (here & other.near).sum() + (there & one.near).sum()
-    return float(shared) / (float(here.sum() + there.sum()) + _HALF_EDGES)
+    edges, other_edges = one.rising & both, other.rising & both
+    shared = (edges & other.near).sum() + (other_edges & one.near).sum()
+    return float(shared) / (float(edges.sum() + other_edges.sum()) + _HALF_EDGES)
 
 
 class StructureScorer:

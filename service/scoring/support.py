@@ -66,7 +66,7 @@ class LocalScoreWeights:
     """Weights for the choice among poses about a metre apart, in nats per unit of each score.
 
     Fitted by a conditional logit over poses around the answers in a validation city. Such poses resemble the same places, so
-    descriptor similarity does not tell them apart. Brightness tells more here than between two streets.
+    descriptor similarity does not separate them. Brightness separates them better than it separates two streets.
 
     Attributes:
         static_inliers: weight of the share of inliers among points of static objects.

@@ -16,7 +16,7 @@ THREADS = 8
 #: Folder of the versions of a map in a store. It has the manifest and the shared files of each version.
 VERSIONS_FOLDER = "versions"
 #: Called with the number of bytes of each piece that was transferred, from several threads.
-Told = Callable[[int], object]
+OnBytes = Callable[[int], object]
 
 
 class _StoppedError(Exception):
@@ -50,7 +50,7 @@ def concurrently(works: Iterable[Callable[[Callable[[], None]], object]]) -> Non
 
 
 def fetch_files(
-    remote: Remote, prefix: str, files: Mapping[str, FileEntry], into: Path, *, told: Told = lambda _: None
+    remote: Remote, prefix: str, files: Mapping[str, FileEntry], into: Path, *, on_bytes: OnBytes = lambda _: None
 ) -> None:
     """Fetch files, the largest first, and check size and hash of each.
 
@@ -59,7 +59,7 @@ def fetch_files(
         prefix: path below the URL, with a slash at the end; or empty.
         files: expected size and hash of each file, by its path. The paths are confined (``is_confined``).
         into: folder for the files. A file that is there is written over from its start.
-        told: called for each piece.
+        on_bytes: called for each piece.
 
     Raises:
         BundleError: a file is missing, cannot be read, or has another size or hash.
@@ -69,12 +69,12 @@ def fetch_files(
     def fetch(name: str, entry: FileEntry, go_on: Callable[[], None]) -> None:
         def count(read: int) -> None:
             go_on()
-            told(read)
+            on_bytes(read)
 
         target = into / name
         target.parent.mkdir(parents=True, exist_ok=True)
         with os.fdopen(os.open(target, os.O_WRONLY | os.O_CREAT, 0o644), "wb") as stream:
-            remote.save(prefix + name, entry, stream, told=count)
+            remote.save(prefix + name, entry, stream, on_bytes=count)
 
     largest_first = sorted(files.items(), key=lambda each: each[1].size, reverse=True)
     concurrently(partial(fetch, name, entry) for name, entry in largest_first)

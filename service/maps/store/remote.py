@@ -149,7 +149,7 @@ class Remote:
         """
         from obstore.exceptions import NotModifiedError
 
-        with self._telling(name):
+        with self._naming_errors(name):
             try:
                 found = self._store.get(name, options={"if_none_match": unless} if unless else None)
             except NotModifiedError:
@@ -178,20 +178,20 @@ class Remote:
             raise
         return None if found is None else found[0]
 
-    def save(self, name: str, entry: FileEntry, target: BinaryIO, *, told: Callable[[int], object]) -> None:
+    def save(self, name: str, entry: FileEntry, target: BinaryIO, *, on_bytes: Callable[[int], object]) -> None:
         """Stream an object into an open file, and check its size and hash.
 
         Args:
             name: path below the URL.
             entry: expected size and hash. Nothing is written if the store announces another size.
             target: open for writing.
-            told: called with the number of bytes of each piece. It may raise to end the transfer.
+            on_bytes: called with the number of bytes of each piece. It may raise to end the transfer.
 
         Raises:
             BundleError: the object is missing, cannot be read, or has another size or hash.
             OSError: the file cannot be written.
         """
-        with self._telling(name):
+        with self._naming_errors(name):
             try:
                 found = self._store.get(name)
             except FileNotFoundError as error:
@@ -201,7 +201,7 @@ class Remote:
             raise self._damaged(name, f"{size} bytes instead of {entry.size}")
         digest, read = hashlib.sha256(), 0
         while True:
-            with self._telling(name):
+            with self._naming_errors(name):
                 chunk = next(chunks, None)
             if chunk is None:
                 break
@@ -210,7 +210,7 @@ class Remote:
                 break
             digest.update(chunk)
             target.write(chunk)
-            told(len(chunk))
+            on_bytes(len(chunk))
         if read != entry.size:
             raise self._damaged(name, f"{read} bytes instead of {entry.size}")
         if digest.hexdigest() != entry.sha256:
@@ -226,7 +226,7 @@ class Remote:
         Raises:
             BundleError: the object cannot be stored.
         """
-        with self._telling(name, "cannot be written"):
+        with self._naming_errors(name, "cannot be written"):
             self._store.put(name, content, max_concurrency=_PARTS)
 
     def _damaged(self, name: str, what: str) -> BundleError:
@@ -238,16 +238,16 @@ class Remote:
         )
 
     @contextmanager
-    def _telling(self, name: str, what: str = "cannot be read") -> Iterator[None]:
+    def _naming_errors(self, name: str, what: str = "cannot be read") -> Iterator[None]:
         """Turn errors of the store inside the context into errors that name the object."""
         from obstore.exceptions import BaseError
 
         try:
             yield
         except FileNotFoundError as error:
-            told = "is missing in the store" if what == "cannot be read" else f"{what} (404: no such bucket)"
+            problem = "is missing in the store" if what == "cannot be read" else f"{what} (404: no such bucket)"
             remedy = "check the URL, or push the map (streetfix map push)"
-            raise BundleError(f"{self.url}/{name} {told}; {remedy}", field=name) from error
+            raise BundleError(f"{self.url}/{name} {problem}; {remedy}", field=name) from error
         except (BaseError, OSError, ValueError) as error:
             raise _failed(f"{self.url}/{name}", what, error) from error
 

@@ -54,7 +54,7 @@ class StoredMap:
     def refresh(self) -> None:
         """Fetch the shared files of the current version, unless the cache has them.
 
-        The store is asked for the manifest only if it has changed since the last call.
+        The store sends the manifest only if it has changed since the last call.
 
         Raises:
             BundleError: the store cannot be read, a file is damaged, or the cache cannot be used.

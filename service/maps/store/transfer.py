@@ -171,14 +171,14 @@ def _pull(remote: Remote, manifest: Manifest, data: bytes, into: Path, report: R
             shutil.rmtree(place)
         make_once(place, partial(_pull_tile, remote, tile, progress))
         copied += 1
-    fetch_files(remote, shared_prefix(remote, manifest), shared, into, told=progress.add)
+    fetch_files(remote, shared_prefix(remote, manifest), shared, into, on_bytes=progress.add)
     (into / FILE).write_bytes(data)
     return Copied(manifest, copied, len(manifest.tiles) - copied, progress.copied)
 
 
 def _pull_tile(remote: Remote, tile: Tile, progress: _Progress, into: Path) -> None:
     manifest, data = tile_manifest(remote, tile)
-    fetch_files(remote, f"{tile.folder}/", manifest.files, into, told=progress.add)
+    fetch_files(remote, f"{tile.folder}/", manifest.files, into, on_bytes=progress.add)
     (into / FILE).write_bytes(data)
 
 

@@ -270,7 +270,7 @@ def test_a_calibration_of_other_features_is_refused(calibration_json, features):
     document = calibration_json(features=[{"name": name, "mean": 0.0, "std": 1.0} for name in features])
     calibration = read_calibration(json.dumps(document).encode(), path="x")
     with pytest.raises(
-        BundleError, match=r"^maps/town: the confidence features are not those of this release \(margin, inliers"
+        BundleError, match=r"^maps/town: the confidence features differ from those of this release \(margin, inliers"
     ) as error:
         require_features(calibration, "maps/town")
     assert error.value.field == "calibration.json"

@@ -54,11 +54,11 @@ def files_of(folder):
     return found
 
 
-def in_this_process(_engine, tasks, *, told, **_):
+def in_this_process(_engine, tasks, *, on_progress, **_):
     """Replace both engines, because processes take seconds to start."""
     for index, task in enumerate(tasks):
-        build_tile(task, partial(told, index))
-        told(index, 1.0)
+        build_tile(task, partial(on_progress, index))
+        on_progress(index, 1.0)
 
 
 @pytest.fixture
@@ -281,7 +281,7 @@ def test_processes_give_the_same_bytes_although_one_is_killed(small_dataset, enc
             process.kill()
 
     out = tmp_path / "m"
-    build_tiled(small_dataset, encoder_file, out, SETTINGS, tile_m=TILE_M, workers=2, report=report, tell=said.append)
+    build_tiled(small_dataset, encoder_file, out, SETTINGS, tile_m=TILE_M, workers=2, report=report, warn=said.append)
     assert files_of(out) == undisturbed
     assert len(killed) == len(said) == 1
     assert "its process was killed by SIGKILL (is the memory full?); the tile goes on in another process" in said[0]
@@ -305,7 +305,7 @@ def test_a_tile_whose_process_dies_again_and_again_stops_the_build(small_dataset
             tile_m=TILE_M,
             workers=1,
             report=report,
-            tell=said.append,
+            warn=said.append,
         )
     assert len(said) == 1
     assert multiprocessing.active_children() == []

@@ -52,9 +52,9 @@ def written(
     return Dataset(folder)
 
 
-def in_this_process(_engine: str, tasks: Any, *, told: Any, **_: Any) -> None:
+def in_this_process(_engine: str, tasks: Any, *, on_progress: Any, **_: Any) -> None:
     for index, task in enumerate(tasks):
-        build_tile(task, partial(told, index))
+        build_tile(task, partial(on_progress, index))
 
 
 def built(dataset: Dataset, encoder: Path, out: Path, settings: BuildSettings = SETTINGS) -> Path:
