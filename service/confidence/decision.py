@@ -114,7 +114,7 @@ class Outcome:
     """How far an answer can be trusted.
 
     Attributes:
-        status: LOCALIZED, AMBIGUOUS or OUT_OF_MAP. Always LOCALIZED if the query asked for no registration or the map has no
+        status: LOCALIZED, AMBIGUOUS or OUT_OF_MAP. Always LOCALIZED if the query requested no registration or the map has no
             calibration.
         confidence: calibrated probability that the position is within 1 m; None in these two cases.
         reasons: what to check; empty for a LOCALIZED answer.
@@ -143,7 +143,7 @@ def decision_of(
     """Decide about an answer, with the prior and the false-accept rate of its query.
 
     Args:
-        calibration: calibration of the map; None if the map has none, or if the query asked for no registration.
+        calibration: calibration of the map; None if the map has none, or if the query requested no registration.
         query: the reference.
         refined: registered candidates; None if nothing was registered, or if the images have too few points.
         evidence: confidence features, in the order of ``service.confidence.features.FEATURES``; None without ``refined``.
@@ -173,7 +173,7 @@ def outcome_of(
     """Compute reasons and spread of an answer from its decision.
 
     Args:
-        calibration: calibration of the map; None if the map has none, or if the query asked for no registration.
+        calibration: calibration of the map; None if the map has none, or if the query requested no registration.
         query: the reference; its false-accept rate counts.
         refined: registered candidates; None if nothing was registered, or if the images have too few points.
         evidence: confidence features, in the order of ``service.confidence.features.FEATURES``; None without ``refined``.

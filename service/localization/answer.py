@@ -54,7 +54,7 @@ class Answer:
 
     Attributes:
         status: how far the answer can be trusted; LOCALIZED if ``confidence`` is None.
-        confidence: calibrated probability that the position is within 1 m. None if the query asked for no registration, the map
+        confidence: calibrated probability that the position is within 1 m. None if the query requested no registration, the map
             has no cloud or no calibration. 0 if the images have too few points to register.
         street: number of the street of the best guess, -1 for none. With registration it is the street under the position, else
             the street of the heaviest cluster.
@@ -73,7 +73,7 @@ class Answer:
         frames: number of image pairs in the query.
         evidence: confidence features, in the order of ``service.confidence.features.FEATURES``; None without registration.
         T_map_vehicle_guess: best guess of the vehicle pose; None if the query does not give the camera's pose on the vehicle.
-        neighbours: distinct places, as many as the query asked for. First those nearest to the registered poses, then the most
+        neighbours: distinct places, as many as the query requested. First those nearest to the registered poses, then the most
             similar.
         hypotheses: all clusters of the most similar views, the heaviest first; a prior, if given, counts in this order.
         measured_share: share of the view grid's cells with a measurement, 0 to 1.

@@ -30,7 +30,7 @@ class QueryResult:
         retrieved: places, clusters and street vote of the reference.
         refined: registered candidates; None if nothing was registered.
         evidence: confidence features; None without ``refined``.
-        decision: status and confidence; None if the query asked for no registration, or the map has no cloud or no calibration.
+        decision: status and confidence; None if the query requested no registration, or the map has no cloud or no calibration.
     """
 
     retrieved: Retrieved
