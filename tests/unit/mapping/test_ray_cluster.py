@@ -74,7 +74,18 @@ def start(cluster: Any, small_dataset: Any, encoder_file: Path, tmp_path: Path) 
 
     def build(name: str, engine: str = "ray") -> "subprocess.Popen[str]":
         command = [sys.executable, "-c", BUILD, "build-map", str(small_dataset.folder), "--out", str(tmp_path / name)]
-        command += ["--encoder", str(encoder_file), "--name", "tiled", "--headings", "6", "--spacing", "5", "--voxel", "0.6"]
+        command += [
+            "--encoder",
+            str(encoder_file),
+            "--name",
+            "tiled",
+            "--headings",
+            "6",
+            "--spacing",
+            "5",
+            "--voxel",
+            "0.6",
+        ]
         command += ["--tile-m", str(TILE_M), "--engine", engine, "--workers", "2"]
         process = subprocess.Popen(
             command,
