@@ -79,7 +79,7 @@ def test_focal_lengths_differ_by_a_fifth_at_most(fy, level):
 def test_images_without_distortion_must_be_rectified():
     for distortion in ([], [0, 0, 0, 0]):
         found = camera_file.check_distortion(camera(distortion=distortion))
-        text = "none given, so both images must be rectified; the command cannot tell"
+        text = "none given, so both images must be rectified; the command cannot check this"
         assert (found.level, found.text) == ("ok", text)
         assert "ruler" in found.remedy
 
