@@ -21,6 +21,7 @@ StreetfixError                     code             kind
 ├── NotReadyError                  not-ready        not_ready    no map is mounted, or the service is stopping
 ├── DeadlineError                  deadline         deadline     a request took longer than the service allows
 ├── BundleError                    bundle           not_ready    a map bundle is missing, damaged or of another version
+├── SearchError                    search           not_ready    the search server does not answer, or lacks views of a map
 ├── DatasetError                   dataset          invalid      a dataset folder is incomplete or inconsistent
 ├── EncoderError                   encoder          not_ready    an encoder file is missing or is not a Streetfix encoder
 ├── UnreachableError               unreachable      not_ready    the service does not answer
@@ -204,6 +205,13 @@ class BundleError(StreetfixError):
     """A map bundle is missing, damaged, or of a version that this release does not support."""
 
     code = "bundle"
+    kind = "not_ready"
+
+
+class SearchError(StreetfixError):
+    """The search server (Qdrant) does not answer, or lacks views of a map."""
+
+    code = "search"
     kind = "not_ready"
 
 

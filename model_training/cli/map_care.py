@@ -1,6 +1,7 @@
 """``streetfix map``: maintain map bundles."""
 
 import json
+import os
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -21,6 +22,7 @@ from service.errors import BundleError
 from service.maps.calibration import RigCorrection
 from service.maps.manifest import read_manifest
 from service.maps.reader import MapBundle
+from service.maps.search_address import COLLECTION
 from service.maps.store.transfer import Copied
 from service.maps.store.transfer import pull as pull_map
 from service.maps.store.transfer import push as push_map
@@ -29,7 +31,7 @@ from service.maps.tiles import open_map
 app = typer.Typer(
     no_args_is_help=True,
     rich_markup_mode=None,
-    help="Maintain map bundles: info, verify, diff, merge, update, push, pull.",
+    help="Maintain map bundles: info, verify, diff, merge, update, push, pull, index.",
 )
 
 _Bundle = Annotated[Path, typer.Argument(help="Folder of a map bundle.")]
@@ -220,6 +222,44 @@ def pull(
     with bars() as report:
         copied = pull_map(url, out, report=report)
     Console(soft_wrap=True).print(f"{_copied_text(copied)}: {out}", highlight=False)
+
+
+@app.command(name="index")
+def index_command(
+    maps: Annotated[list[Path], typer.Argument(help="Folders of tiled maps.", metavar="MAP...")],
+    qdrant: Annotated[
+        str, typer.Option(envvar="STREETFIX_QDRANT_URL", help="URL of the server, such as http://127.0.0.1:6333.")
+    ],
+    collection: Annotated[
+        str, typer.Option(envvar="STREETFIX_QDRANT_COLLECTION", help="Name of the collection.")
+    ] = COLLECTION,
+    prune: Annotated[
+        bool, typer.Option("--prune", help="Delete the views of all tiles that none of these maps has.")
+    ] = False,
+) -> None:
+    """Bring a collection of Qdrant in line with tiled maps.
+
+    The command skips tiles whose views are all there. If it was interrupted, run it again.
+    With --prune, name every map and version that a service has mounted.
+    The key of the server comes from STREETFIX_QDRANT_API_KEY. Needs the extra `qdrant`.
+
+    \b
+    Example:
+      streetfix map index maps/town --qdrant http://127.0.0.1:6333
+    """
+    from service.maps.qdrant import Collection, index_maps
+
+    opened = Collection.open(qdrant, collection, api_key=os.environ.get("STREETFIX_QDRANT_API_KEY") or None)
+    try:
+        with bars() as report:
+            done = index_maps(maps, opened, prune=prune, report=report)
+    finally:
+        opened.close()
+    Console(soft_wrap=True).print(
+        f"collection {collection}: {done.views} views of {done.sent} tiles sent, {done.kept} tiles there already, "
+        f"{done.deleted} views deleted",
+        highlight=False,
+    )
 
 
 def _copied_text(copied: Copied) -> str:

@@ -20,7 +20,7 @@ from service.maps import content as parts
 from service.maps import inverted_file, manifest, streets
 from service.maps.calibration import read_calibration
 from service.maps.files import defect, json_object, map_array, read_file, require_files
-from service.maps.index import ViewIndex
+from service.maps.index import Shortlister, ViewIndex
 from service.maps.inverted_file import InvertedFile
 from service.maps.joined_index import JoinedRows, JoinedShortlists
 from service.maps.manifest import Manifest, Tile, read_manifest
@@ -81,6 +81,26 @@ class TileSource(Protocol):
         """
 
 
+@runtime_checkable
+class PlaceSearch(Shortlister, Protocol):
+    """Finds the views of a whole map that resemble a query: ``InvertedFile``, or a server that has the views."""
+
+    def most_similar(self, descriptor: Float32[NDArray[np.float32], " D"], k: int) -> Int64[NDArray[np.int64], " n"]:
+        """Return the indices of about the k most similar views, the most similar first.
+
+        Args:
+            descriptor: descriptor of the query view.
+            k: length of the list, at most the number of views.
+
+        Raises:
+            SearchError: a server does not answer, or lacks views of the map.
+        """
+
+
+#: Opens the search of a map by its manifest.
+OpenSearch = Callable[[Manifest], PlaceSearch]
+
+
 @dataclass(frozen=True, slots=True)
 class LocalTiles:
     """Tiles in the folder of the map.
@@ -122,7 +142,14 @@ class LocalTiles:
         """
 
 
-def open_map(path: Path, *, verify: bool = True, source: TileSource | None = None, open_bytes: int = OPEN_BYTES) -> Map:
+def open_map(
+    path: Path,
+    *,
+    verify: bool = True,
+    source: TileSource | None = None,
+    open_bytes: int = OPEN_BYTES,
+    open_search: OpenSearch | None = None,
+) -> Map:
     """Open a map of one bundle or a tiled map.
 
     Args:
@@ -130,12 +157,14 @@ def open_map(path: Path, *, verify: bool = True, source: TileSource | None = Non
         verify: compare the hash of every file with the manifest. Those of a tile are compared when it is first opened.
         source: where the tiles of a tiled map come from; None takes them from ``path``.
         open_bytes: limit of the size of all open tiles of a tiled map, bytes.
+        open_search: opens the search of a map of more than ``MOST_SEARCHED`` tiles; None takes the search index in ``path``.
 
     Raises:
         BundleError: the map is missing, damaged, of another format, or inconsistent.
+        SearchError: the search cannot be opened.
     """
     if read_manifest(path).tiles:
-        return TiledMap.open(path, verify=verify, source=source, open_bytes=open_bytes)
+        return TiledMap.open(path, verify=verify, source=source, open_bytes=open_bytes, open_search=open_search)
     return MapBundle.open(path, verify=verify)
 
 
@@ -416,15 +445,21 @@ class TiledMap(Map):
 
     Attributes:
         tiles: opens the tiles.
-        inverted: search index of the whole map; None if the map has few tiles.
+        search: of the whole map; None if the map has few tiles.
     """
 
     tiles: OpenTiles
-    inverted: InvertedFile | None
+    search: PlaceSearch | None
 
     @classmethod
     def open(
-        cls, path: Path, *, verify: bool = True, source: TileSource | None = None, open_bytes: int = OPEN_BYTES
+        cls,
+        path: Path,
+        *,
+        verify: bool = True,
+        source: TileSource | None = None,
+        open_bytes: int = OPEN_BYTES,
+        open_search: OpenSearch | None = None,
     ) -> "TiledMap":
         """Open a tiled map. This opens none of its tiles.
 
@@ -433,9 +468,11 @@ class TiledMap(Map):
             verify: compare the hash of every file with the manifest. Those of a tile are compared when it is first opened.
             source: where the tiles come from; None takes them from ``path``.
             open_bytes: limit of the size of all open tiles, bytes. At least one tile is open.
+            open_search: opens the search of a map of more than ``MOST_SEARCHED`` tiles; None takes the search index in ``path``.
 
         Raises:
             BundleError: the map is missing, damaged, of another format, or inconsistent.
+            SearchError: the search cannot be opened.
         """
         read = read_manifest(path)
         if not read.tiles:
@@ -446,7 +483,7 @@ class TiledMap(Map):
         document = read_file(path / streets.FILE) if streets.FILE in read.files else None
         named = None if document is None else Streets.from_geojson(json_object(document, path / streets.FILE))
         tiles = OpenTiles(path, read, named, source or LocalTiles(path), verify=verify, open_bytes=open_bytes)
-        inverted = _inverted(path, read, verify=verify)
+        search = _search(path, read, open_search, verify=verify)
         every, sizes = range(len(tiles)), [tile.counts.views for tile in read.tiles]
         rows = JoinedRows(sizes, read.counts.descriptor_size, lambda k: tiles.get(k).view_index.rows)
         opened = cls(
@@ -456,7 +493,7 @@ class TiledMap(Map):
             rows_seen=np.array(read.rows_seen, np.bool_),
             places=map_array(path / parts.PLACES_FILE, expected=parts.PLACE),
             views=np.empty(0, parts.VIEW),
-            view_index=ViewIndex(rows, inverted or JoinedShortlists(sizes, lambda k: tiles.get(k).view_index)),
+            view_index=ViewIndex(rows, search or JoinedShortlists(sizes, lambda k: tiles.get(k).view_index)),
             streets=named,
             streets_document=document,
             calibration=read_calibration(
@@ -464,7 +501,7 @@ class TiledMap(Map):
             ),
             cloud=tiles.cloud(every),
             tiles=tiles,
-            inverted=inverted,
+            search=search,
         )
         _require_consistent(opened)
         return opened
@@ -491,8 +528,8 @@ class TiledMap(Map):
         if near is not None and ((away_m := _away_m(self.tiles.squares_m, near[0])) <= near[1]).any():
             chosen = np.argsort(away_m, kind="stable")
             chosen = chosen[away_m[chosen] <= near[1]]  # the nearest first
-        if len(chosen) > MOST_SEARCHED and self.inverted is not None:
-            views = self.inverted.most_similar(descriptor, min(LISTED, self.manifest.counts.views))
+        if len(chosen) > MOST_SEARCHED and self.search is not None:
+            views = self.search.most_similar(descriptor, min(LISTED, self.manifest.counts.views))
             similar = in_order(
                 np.searchsorted(self.tiles.first_place, views // self.manifest.headings, side="right") - 1
             )
@@ -564,7 +601,9 @@ def _away_m(
     return away
 
 
-def _inverted(path: Path, read: Manifest, *, verify: bool) -> InvertedFile | None:
+def _search(path: Path, read: Manifest, open_search: OpenSearch | None, *, verify: bool) -> PlaceSearch | None:
+    if open_search is not None and len(read.tiles) > MOST_SEARCHED:
+        return open_search(read)
     if inverted_file.FILE in read.files:
         return InvertedFile.open(
             path / inverted_file.FILE,

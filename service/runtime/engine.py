@@ -16,9 +16,11 @@ from service.localization.answer import Answer
 from service.localization.localizer import Localizer
 from service.localization.track_bytes import packed, unpacked
 from service.localization.tracker import Track, follow
+from service.maps.manifest import Manifest
 from service.maps.map import Map
 from service.maps.store.cache import TileCache, default_folder
 from service.maps.store.stored_map import StoredMap
+from service.maps.tiles import OpenSearch
 from service.option_limits import NEIGHBOURS
 from service.retrieval.prior import Prior
 from service.retrieval.query import DepthFormat, Query, decoded_query
@@ -324,6 +326,7 @@ def watcher_of(registry: MapRegistry, settings: Settings) -> MapWatcher:
 
     Raises:
         BundleError: there are maps in object storage, and the folder of the cache cannot be used.
+        ExtraMissingError: the settings have a search server, and its client is not installed.
     """
     stored = []
     if urls := [each for each in settings.maps if isinstance(each, MapUrl)]:
@@ -337,7 +340,27 @@ def watcher_of(registry: MapRegistry, settings: Settings) -> MapWatcher:
         warm=partial(warm_up, settings.false_accept_rate),
         stored=stored,
         open_tile_bytes=settings.open_tile_bytes,
+        open_search=None if settings.qdrant_url is None else _search_server(settings, settings.qdrant_url),
     )
+
+
+def _search_server(settings: Settings, url: str) -> OpenSearch:
+    """Return what opens the search of a map in Qdrant."""
+    from service.maps.qdrant import CARE_S, Collection, QdrantSearch
+
+    key = None if settings.qdrant_api_key is None else settings.qdrant_api_key.get_secret_value()
+    open_collection = partial(Collection.open, url, settings.qdrant_collection, api_key=key)
+    collection = open_collection(timeout_s=settings.qdrant_timeout_s)
+
+    def open_search(of_map: Manifest) -> QdrantSearch:
+        search, counting = QdrantSearch(collection, of_map), open_collection(timeout_s=CARE_S)
+        try:
+            search.require_complete(counting)
+        finally:
+            counting.close()
+        return search
+
+    return open_search
 
 
 def warm_up(false_accept_rate: float, localizer: Localizer) -> None:

@@ -8,11 +8,11 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from service.errors import BundleError, StreetfixError
+from service.errors import BundleError, SearchError, StreetfixError
 from service.localization.localizer import Localizer
 from service.maps.manifest import TILES_FOLDER, Manifest, Tile, read_manifest
 from service.maps.store.stored_map import StoredMap
-from service.maps.tiles import OPEN_BYTES, TileSource, open_map
+from service.maps.tiles import OPEN_BYTES, OpenSearch, TileSource, open_map
 from service.runtime.map_registry import MapRegistry, Refused, bundle_paths, twin_error, version_of
 from service.runtime.serving_table import Key, MapVersion
 from service.runtime.wakeup import Wakeup
@@ -79,6 +79,7 @@ class MapWatcher:
             refused for this reason.
         stored: maps in object storage, with which the service was started. Their folders in the cache are folders of bundles.
         open_tile_bytes: limit of the size of all open tiles of a tiled map, bytes.
+        open_search: opens the search of a map of many tiles; None takes the search index of the map.
     """
 
     def __init__(
@@ -89,11 +90,12 @@ class MapWatcher:
         warm: Callable[[Localizer], None],
         stored: Sequence[StoredMap] = (),
         open_tile_bytes: int = OPEN_BYTES,
+        open_search: OpenSearch | None = None,
     ) -> None:
         self._registry = registry
         self._stored = {each.folder: each for each in stored}
         self._paths = (*paths, *self._stored)
-        self._warm, self._open_tile_bytes = warm, open_tile_bytes
+        self._warm, self._open_tile_bytes, self._open_search = warm, open_tile_bytes, open_search
         self._stop, self._wakeup = threading.Event(), Wakeup()
         self._thread: threading.Thread | None = None
         self._manifests: dict[Path, tuple[Stamp, Manifest]] = {}
@@ -236,12 +238,15 @@ class MapWatcher:
         try:
             if (stored := self._stored.get(bundle.path.parent)) is not None:
                 source = _LoggedTiles(stored.tiles(bundle.path))
-            opened = open_map(bundle.path, source=source, open_bytes=self._open_tile_bytes)
+            opened = open_map(
+                bundle.path, source=source, open_bytes=self._open_tile_bytes, open_search=self._open_search
+            )
             localizer = Localizer.open(opened, provider=self._registry.provider)
             self._warm(localizer)
             self._registry.mount(localizer)
         except StreetfixError as error:
-            if source is not None and source.has_failed:  # the store may answer again, so the next scan tries again
+            # The store or the search server may answer again, so the next scan tries again.
+            if isinstance(error, SearchError) or (source is not None and source.has_failed):
                 stamp = _NEVER
             return self._refuse(bundle.path, stamp, error)
         except Exception as error:  # any defect refuses only this bundle; the others are still processed

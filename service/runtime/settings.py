@@ -6,7 +6,7 @@ Later sources override earlier ones: defaults, TOML file, environment ``STREETFI
 import os
 import re
 import tomllib
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from ipaddress import IPv4Address, IPv6Address, ip_address
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -23,6 +23,7 @@ from pydantic_settings import (
 
 from service.errors import BundleError, RequestError
 from service.imaging.picture_headers import DEFAULT_LIMITS
+from service.maps.search_address import COLLECTION, QUERY_S, checked_name, checked_search_url
 from service.maps.store.remote import checked_url, is_url
 from service.maps.tiles import OPEN_BYTES
 from service.option_limits import FALSE_ACCEPT_RATE, LEAST_FALSE_ACCEPT_RATE
@@ -35,6 +36,10 @@ _LABEL = r"[a-z0-9_]([a-z0-9_-]{0,61}[a-z0-9_])?"
 #: A map in a list with colons: a URL, whose credentials are refused later, or a path.
 _MAP_PATTERN = re.compile(r"\w+://(?:[^/@]*@)?[^:]*|[^:]+")
 _HOST_PATTERN = re.compile(rf"\*|(\*\.)?{_LABEL}(\.{_LABEL})*")
+
+
+#: Settings whose values a message must not show.
+_NOT_SHOWN = ("qdrant_url", "qdrant_api_key")
 
 
 class MapUrl(str):
@@ -106,6 +111,16 @@ class Settings(BaseSettings):
         ge=1_000_000,
         le=2**60,
         description="bound of the tiles of a tiled map that a worker has open; the least recently used ones are closed",
+    )
+    qdrant_url: str | None = Field(
+        None,
+        description="server of Qdrant that chooses the tiles of tiled maps, as http://127.0.0.1:6333; needs the extra qdrant. By default "
+        "the search index of the map chooses them",
+    )
+    qdrant_collection: str = Field(COLLECTION, description="collection of this server (streetfix map index)")
+    qdrant_api_key: SecretStr | None = Field(None, description="key of this server")
+    qdrant_timeout_s: float = Field(
+        QUERY_S, gt=0, le=60, description="seconds for the answer of this server to a query; a later one gets 503"
     )
     strict: bool = Field(
         False,
@@ -221,10 +236,20 @@ class Settings(BaseSettings):
             )
         return self
 
-    @field_validator("belief_key", mode="before")
+    @field_validator("belief_key", "qdrant_url", "qdrant_api_key", mode="before")
     @classmethod
     def _none_if_empty(cls, value: object) -> object:
         return value or None
+
+    @field_validator("qdrant_url")
+    @classmethod
+    def _search_url(cls, value: str | None) -> str | None:
+        return None if value is None else _valid(checked_search_url, value)
+
+    @field_validator("qdrant_collection")
+    @classmethod
+    def _collection(cls, value: str) -> str:
+        return _valid(checked_name, value)
 
     @field_validator("maps", mode="before")
     @classmethod
@@ -243,6 +268,13 @@ class Settings(BaseSettings):
     @classmethod
     def _host_patterns(cls, value: tuple[str, ...]) -> tuple[str, ...]:
         return tuple(_host_pattern(each) for each in value)
+
+
+def _valid(check: Callable[[str], str], value: str) -> str:
+    try:
+        return check(value)
+    except RequestError as error:  # pydantic reports it with the name of the setting
+        raise ValueError(error.message) from error
 
 
 def is_loopback(host: str) -> bool:
@@ -297,8 +329,8 @@ def load_settings(config: Path | None = None, **flags: object) -> Settings:
         where = ".".join(str(part) for part in first["loc"])
         if first["type"] == "extra_forbidden":
             what = f"setting {where}: there is no such setting{did_you_mean(where, setting_names(Settings))}; docs/serving.md lists them"
-        elif first["loc"][:1] == ("maps",):  # nor the credentials of a URL
-            what = f"setting maps: {first['msg'].removeprefix('Value error, ')}"
+        elif where in _NOT_SHOWN or first["loc"][:1] == ("maps",):  # nor the credentials of a URL
+            what = f"setting {first['loc'][0]}: {first['msg'].removeprefix('Value error, ')}"
         elif where == "belief_key":  # a message must not show a secret
             what = f"setting belief_key: the value is not valid; give {LEAST_KEY} random characters or more, or leave it out"
         elif where:
