@@ -9,8 +9,11 @@ from typing import Any
 import httpx
 import numpy as np
 import pytest
+from pydantic import SecretStr
 
+from service.errors import SearchError
 from service.geometry.rigid import transform_from
+from service.maps import tiles as tiles_module
 from service.maps.content import BundleContent
 from service.maps.tiled_writer import write_tiled
 from service.maps.tiles import TiledMap
@@ -148,3 +151,57 @@ def test_a_tile_that_vanished_is_a_clear_error(
     problem = json.dumps(response.json())
     assert "manifest.json is missing" in problem
     assert str(tmp_path) not in problem
+
+
+def test_a_search_server_that_fails_is_503_and_its_return_mounts_the_map(
+    tiled_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    client_of: Callable[[Engine], httpx.Client],
+    parts_of: Callable[..., dict[str, bytes]],
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    pytest.importorskip("qdrant_client")
+    from service.maps.qdrant import Collection, QdrantSearch, index_maps
+    from tests.unit.maps.fake_qdrant import FakeQdrant
+
+    monkeypatch.setattr(tiles_module, "MOST_SEARCHED", 3)
+    files = {name: (name, data) for name, data in parts_of().items()}
+    with FakeQdrant().serving() as fake:
+        settings = Settings(
+            maps=(tiled_path.parent,), threads=1, queue=1, qdrant_url=fake.url, qdrant_api_key=SecretStr("a-secret-key")
+        )
+        with pytest.raises(SearchError, match="is there such a collection"):
+            Engine.open(settings)
+        index_maps([tiled_path], Collection.open(fake.url))
+        engine = Engine.open(settings)
+        try:
+            (opened,) = (each.bundle for each in engine.registry)
+            assert isinstance(opened, TiledMap)
+            assert isinstance(opened.search, QdrantSearch)
+            assert fake.requests[-1] == "POST /points/query"  # the warm-up
+            assert fake.keys[-1] == "a-secret-key"
+            client = client_of(engine)
+            assert client.post("/v1/localize", files=files).json()["status"] == "LOCALIZED"
+            assert fake.requests.count("POST /points/query") == 2
+            fake.before = _unavailable
+            problem = client.post("/v1/localize", files=files)
+            assert (problem.status_code, problem.json()["code"]) == (503, "search")
+            assert problem.headers["Retry-After"] == "1"
+            assert "127.0.0.1" not in problem.text
+            assert client.get("/readyz").status_code == 200
+            # A new version meets the failing server. It is mounted when the server answers again.
+            engine.registry.unmount("tiny", opened.manifest.version)
+            assert "status 503" in engine.watcher.scan()[0]
+            assert "127.0.0.1" not in client.get("/readyz").text
+            fake.before = lambda _: False
+            assert engine.watcher.scan() == [f"mounted tiny {opened.manifest.version}"]
+        finally:
+            engine.close()
+    assert "a-secret-key" not in caplog.text
+
+
+def _unavailable(request: Any) -> bool:
+    request.send_response(503)
+    request.send_header("Content-Length", "0")
+    request.end_headers()
+    return True

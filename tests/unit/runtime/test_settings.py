@@ -209,3 +209,27 @@ def test_an_empty_secret_is_none_and_a_valid_one_is_masked(monkeypatch: pytest.M
     assert settings.belief_key is not None
     assert settings.belief_key.get_secret_value() == "s" * 32
     assert "sss" not in settings.model_dump_json()
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [("URL", "http://user:hunter2@host"), ("URL", "ftp://hunter2"), ("COLLECTION", "a/b"), ("TIMEOUT_S", "0")],
+)
+def test_a_wrong_search_server_is_refused(monkeypatch: pytest.MonkeyPatch, name: str, value: str) -> None:
+    monkeypatch.setenv(f"STREETFIX_QDRANT_{name}", value)
+    with pytest.raises(RequestError, match=f"setting qdrant_{name.lower()}: ") as caught:
+        load_settings()
+    assert "hunter2" not in str(caught.value)
+
+
+def test_the_key_of_a_search_server_is_masked(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("STREETFIX_QDRANT_API_KEY", "")
+    monkeypatch.setenv("STREETFIX_QDRANT_URL", "")
+    assert (load_settings().qdrant_api_key, load_settings().qdrant_url) == (None, None)
+    monkeypatch.setenv("STREETFIX_QDRANT_API_KEY", "hunter2")
+    monkeypatch.setenv("STREETFIX_QDRANT_URL", "http://127.0.0.1:6333")
+    settings = load_settings()
+    assert settings.qdrant_api_key is not None
+    assert settings.qdrant_api_key.get_secret_value() == "hunter2"
+    assert settings.qdrant_url == "http://127.0.0.1:6333"
+    assert "hunter2" not in settings.model_dump_json() + repr(settings)
