@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Iterable
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -11,10 +12,12 @@ from numpy.typing import NDArray
 from service.errors import BundleError
 from service.imaging.npy_header import NPY_HEADER_ERRORS
 from service.maps import content as parts
-from service.maps.manifest import Manifest
+from service.maps.manifest import FileEntry, Manifest
 from service.maps.writer import sha256_of
 
 REMEDY = "copy or build the bundle again"
+#: Threads that hash the files of a bundle. hashlib releases the interpreter lock.
+_HASHING_THREADS = 4
 
 
 def require_files(path: Path, manifest: Manifest, needed: Iterable[str], *, verify: bool) -> None:
@@ -32,6 +35,7 @@ def require_files(path: Path, manifest: Manifest, needed: Iterable[str], *, veri
     for name in needed:
         if name not in manifest.files:
             raise defect(path / name, "not listed in the manifest")
+    compared: list[tuple[Path, FileEntry]] = []
     for name, entry in manifest.files.items():
         file = path / name
         if name in parts.NOT_SERVED and not file.exists():
@@ -40,16 +44,40 @@ def require_files(path: Path, manifest: Manifest, needed: Iterable[str], *, veri
             raise defect(file, "missing, or outside the bundle")
         try:
             size = file.stat().st_size
-            is_compared = verify and size == entry.size and name not in parts.NOT_SERVED
-            found = sha256_of(file) if is_compared else entry.sha256
         except OSError as error:  # for example, somebody removes the bundle meanwhile
-            raise defect(file, f"cannot be read ({error.strerror})") from error
+            raise _unreadable(file, error) from error
         if size != entry.size:
             raise defect(file, f"{size} bytes instead of {entry.size}")
-        if found != entry.sha256:
-            raise defect(file, "the hash does not match the manifest")
+        if verify and name not in parts.NOT_SERVED:
+            compared.append((file, entry))
+    _compare_hashes(compared)
     if manifest.files[parts.ENCODER_FILE].sha256 != manifest.encoder_sha256:
         raise defect(path / parts.ENCODER_FILE, "not the encoder that computed the descriptors")
+
+
+def _compare_hashes(files: list[tuple[Path, FileEntry]]) -> None:
+    """Compare the hashes of files with the manifest. Hashing runs in threads, because a request may wait for a tile to be opened.
+
+    Raises:
+        BundleError: a file cannot be read, or its hash is another one.
+    """
+    if not files:
+        return
+    with ThreadPoolExecutor(min(len(files), _HASHING_THREADS)) as threads:
+        for (file, entry), found in zip(files, threads.map(_hash_of, [file for file, _ in files]), strict=True):
+            if found != entry.sha256:
+                raise defect(file, "the hash does not match the manifest")
+
+
+def _hash_of(file: Path) -> str:
+    try:
+        return sha256_of(file)
+    except OSError as error:  # for example, somebody removes the bundle meanwhile
+        raise _unreadable(file, error) from error
+
+
+def _unreadable(file: Path, error: OSError) -> BundleError:
+    return defect(file, f"cannot be read ({error.strerror})")
 
 
 def read_file(path: Path) -> bytes:
@@ -64,7 +92,7 @@ def read_file(path: Path) -> bytes:
     try:
         return path.read_bytes()
     except OSError as error:  # for example, somebody removes the bundle meanwhile
-        raise defect(path, f"cannot be read ({error.strerror})") from error
+        raise _unreadable(path, error) from error
 
 
 def map_array(path: Path, *, expected: np.dtype[Any] | None) -> NDArray[Any]:
