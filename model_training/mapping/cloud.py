@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from model_training.mapping.preview import preview_webp
 from model_training.mapping.voxel_map import VoxelMap
@@ -15,6 +16,12 @@ from service.registration.surfel_map import SurfelMap
 
 #: Largest range of a point in the cloud, metres.
 CLOUD_REACH_M = 40.0
+#: Name of the parameter with the height up to which the survey saw surfaces, metres above the ground.
+SURVEYED_HEIGHT = "surveyed_height_m"
+#: This share of the surfels above ``_GROUND_M`` lies lower than ``_RIM_M`` below the surveyed height. The rim keeps the upper edges of
+#: walls, and allows for errors of the level. Surfels farther than ``_BESIDE_M`` from the places do not count, because the ground there
+#: may have another height. At most ``_MOST_SURFELS`` count.
+_SURVEYED_SHARE, _RIM_M, _GROUND_M, _BESIDE_M, _MOST_SURFELS = 0.999, 0.5, 0.3, 25.0, 200_000
 
 
 def near(
@@ -50,9 +57,32 @@ def with_cloud(content: BundleContent, cloud: VoxelMap) -> BundleContent:
         cloud: the voxel map of the cloud.
     """
     surfel_map = prepared(cloud)
+    height_m = None if surfel_map is None else surveyed_height_m(surfel_map, content)
+    others = {name: value for name, value in content.parameters.items() if name != SURVEYED_HEIGHT}
     return replace(
         content,
+        parameters=others if height_m is None else others | {SURVEYED_HEIGHT: height_m},
         cloud=surfel_map,
         statistics=None if surfel_map is None else cloud.columns(),
         preview_webp=preview_webp(surfel_map, content.T_map_place[:, :3, 3]),
     )
+
+
+def surveyed_height_m(cloud: SurfelMap, content: BundleContent) -> float | None:
+    """Return the height above the ground up to which the survey saw surfaces, metres; None without surfels beside the places.
+
+    A LiDAR with few beams above the horizon sees only the lower part of a street. A camera also sees what lies higher. Such points
+    have no surfel near them at any pose, so registration omits them (decision 0177).
+
+    Args:
+        cloud: cloud of the map.
+        content: the map. Its places give the ground.
+    """
+    xyz = cloud.unpacked(slice(None, None, 1 + len(cloud.surfels) // _MOST_SURFELS))["xyz"] + cloud.origin_m
+    places_m = content.T_map_place[:, :3, 3]
+    if not len(places_m):
+        return None
+    distance_m, nearest = cKDTree(places_m[:, :2]).query(xyz[:, :2])
+    above_m = xyz[:, 2] - (places_m[nearest, 2] - content.parameters["lidar_height_m"])
+    counted = above_m[(distance_m < _BESIDE_M) & (above_m > _GROUND_M)]
+    return float(np.quantile(counted, _SURVEYED_SHARE)) + _RIM_M if len(counted) else None

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from model_training.mapping.cloud import SURVEYED_HEIGHT
 from model_training.mapping.places import streets_of, views_of
 from service.errors import BundleError
 from service.maps import inverted_file
@@ -27,6 +28,7 @@ _OF_A_DRIVE = (
     "expected_lidar_height_m",
     "survey_position_std_m",
     "survey_angle_std_deg",
+    SURVEYED_HEIGHT,  # measured again with the joined cloud
     inverted_file.RECALL,  # the writer measures it again
 )
 #: Standard deviations of which the joined map keeps the larger one.

@@ -111,7 +111,11 @@ def refine(
         settings = settings_for_rig(settings, rig_px_m)
     # 1. Points of all frames, in the level frame of the reference.
     measured = measure(
-        frames, settings.points, focal_baseline_px_m=settings.focal_baseline_px_m, is_rig=rig_px_m is not None
+        frames,
+        settings.points,
+        focal_baseline_px_m=settings.focal_baseline_px_m,
+        is_rig=rig_px_m is not None,
+        surveyed_height_m=bundle.manifest.surveyed_height_m,
     )
     points = merged_points(measured)
     if len(points) < settings.fewest_points:

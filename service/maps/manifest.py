@@ -167,6 +167,11 @@ class Manifest(_Frozen):
         """Standard deviations of the survey's positions (metres) and angles (degrees); None if the map does not state them."""
         return self.parameters.get("survey_position_std_m"), self.parameters.get("survey_angle_std_deg")
 
+    @property
+    def surveyed_height_m(self) -> float | None:
+        """Height above the ground up to which the survey saw surfaces, metres; None if the map does not state it."""
+        return self.parameters.get("surveyed_height_m")
+
     def expected_version(self) -> str:
         """Return the version: the first 16 hexadecimal digits of the SHA-256 of the content.
 

@@ -21,8 +21,8 @@ from service.maps.tiles import MOST_SEARCHED, differences, places_in_map, street
 from service.maps.writer import in_place, json_bytes, link_or_copy, sha256_of, sync
 
 _NEEDED = (parts.ENCODER_FILE, index.FILE, parts.PLACES_FILE, parts.VIEWS_FILE, parts.CALIBRATION_FILE)
-#: Standard deviations of which the map states the largest of all tiles.
-WORST = ("survey_position_std_m", "survey_angle_std_deg")
+#: Parameters of which the map states the largest of all tiles.
+LARGEST = ("survey_position_std_m", "survey_angle_std_deg", "surveyed_height_m")
 _REMEDY = "build all tiles with the same encoder and settings"
 
 
@@ -131,7 +131,7 @@ def _write_shared(
     (folder / parts.CALIBRATION_FILE).write_bytes(json_bytes(_calibration(bundles, rig)))
     parameters = {key: value for key, value in first.parameters.items() if key in _common(manifests)}
     parameters["lidar_height_m"] = lidar_height_m
-    for key in WORST:
+    for key in LARGEST:
         stated = [each.parameters[key] for each in manifests if key in each.parameters]
         parameters |= {key: max(stated)} if stated else {}
     if len(tiles) > MOST_SEARCHED:

@@ -8,7 +8,7 @@ Speed: ``points.c`` takes a third of the time of NumPy for the blocks, and half 
 
 import ctypes
 from ctypes import POINTER, Structure, byref, c_double, c_int64, c_void_p
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
 from typing import NamedTuple
@@ -261,11 +261,33 @@ def movable_of(
         height_m: height of the camera above the ground, m.
         settings: of the blocks and points.
     """
+    return _may_move(_above_ground_m(blocks, R_level_camera, height_m), settings) & (blocks.z_m > 0)
+
+
+def below(blocks: DepthBlocks, R_level_camera: Rotation, height_m: float, highest_m: float) -> DepthBlocks:
+    """Omit the blocks that lie higher above the ground than a limit.
+
+    Args:
+        blocks: of the depth image, as ``blocks_of`` returns them.
+        R_level_camera: rotation from the camera's optical frame to the level frame.
+        height_m: height of the camera above the ground, m.
+        highest_m: limit, m above the ground.
+    """
+    kept = _above_ground_m(blocks, R_level_camera, height_m) <= highest_m
+    return replace(blocks, z_m=np.where(kept, blocks.z_m, np.float32(0)))
+
+
+def _above_ground_m(
+    blocks: DepthBlocks, R_level_camera: Rotation, height_m: float
+) -> Float64[NDArray[np.float64], "H W"]:
+    """Return the height of each block above the ground, m; the camera's height where nothing was measured."""
     own = blocks.camera
     v, u = (np.arange(side)[of] for side, of in ((own.height, np.s_[:, None]), (own.width, np.s_[None])))
     x, y, z = R_level_camera[2]
-    above_m = blocks.z_m * (x * (u - own.cx) / own.fx + y * (v - own.cy) / own.fy + z) + height_m
-    return _may_move(above_m, settings) & (blocks.z_m > 0)
+    above_m: Float64[NDArray[np.float64], "H W"] = (
+        blocks.z_m * (x * (u - own.cx) / own.fx + y * (v - own.cy) / own.fy + z) + height_m
+    )
+    return above_m
 
 
 def _may_move(

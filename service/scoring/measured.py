@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from service.geometry.rigid import Transform, transform_from
 from service.registration.kernel import QueryPoints
-from service.registration.points import DepthBlocks, PointSettings, blocks_of, movable_of, points_from
+from service.registration.points import DepthBlocks, PointSettings, below, blocks_of, movable_of, points_from
 from service.registration.rays import RayPicture, picture_of
 from service.registration.register import Registered
 from service.retrieval.retrieve import EncodedFrame
@@ -52,7 +52,12 @@ class MeasuredFrame:
 
 
 def measure(
-    frames: tuple[EncodedFrame, ...], settings: PointSettings, *, focal_baseline_px_m: float, is_rig: bool
+    frames: tuple[EncodedFrame, ...],
+    settings: PointSettings,
+    *,
+    focal_baseline_px_m: float,
+    is_rig: bool,
+    surveyed_height_m: float | None = None,
 ) -> tuple[MeasuredFrame, ...]:
     """Prepare the depth of all frames.
 
@@ -61,10 +66,13 @@ def measure(
         settings: settings of the thinning of a depth image to points.
         focal_baseline_px_m: focal length (px) times baseline (m) of the stereo rig, or an assumed one.
         is_rig: whether the stereo rig is known. Its disparity offset is then an unknown of the ray adjustment.
+        surveyed_height_m: the map has no surfaces higher than this above the ground, m, so depth above it is omitted; None if unknown.
     """
     measured = []
     for frame in frames:
         blocks = blocks_of(frame.query.depth_m, frame.query.camera, settings, noise=frame.noise)
+        if surveyed_height_m is not None:
+            blocks = below(blocks, frame.R_level_camera, frame.views.height_m, surveyed_height_m)
         points = points_from(
             blocks,
             frame.R_level_camera,

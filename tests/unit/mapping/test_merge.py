@@ -321,3 +321,10 @@ def test_a_joined_map_states_the_worse_accuracy_of_both_surveys(whole):
     require_same(first, second, names=("one", "other"))
     found = joined(first, second).parameters
     assert (found["survey_position_std_m"], found["survey_angle_std_deg"]) == (0.08, 0.1)
+
+
+def test_maps_of_other_surveyed_heights_are_joined(whole):
+    """Two traversals past houses of other heights may differ. The joined cloud is measured again."""
+    content = content_of(whole)
+    other = replace(content, parameters={**content.parameters, "surveyed_height_m": 1.0})
+    require_same(content, other, names=("one", "other"))

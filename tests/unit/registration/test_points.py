@@ -7,7 +7,14 @@ from hypothesis import strategies as st
 
 from service.geometry.camera import PinholeCamera
 from service.geometry.rigid import R_BODY_OPTICAL, rotation_y
-from service.registration.points import LEAST_NOISE, PointSettings, inverse_depth_noise, points_of
+from service.registration.points import (
+    LEAST_NOISE,
+    PointSettings,
+    below,
+    blocks_of,
+    inverse_depth_noise,
+    points_of,
+)
 
 ALL = PointSettings(columns=80, points=100_000, ground_share=0.5)
 HIGH_M = 100.0  # so high that no point is of the ground or of a vehicle
@@ -300,3 +307,28 @@ def test_a_stereo_rigs_noise_is_that_of_matching_at_least():
     assert inverse_depth_noise(tilted_plane(320, 240), focal_baseline_px_m=80.0).total == pytest.approx(floor, rel=1e-5)
     noisy = tilted_plane(320, 240, noise=floor)
     assert inverse_depth_noise(noisy, focal_baseline_px_m=80.0).total == pytest.approx(floor * 2**0.5, rel=0.05)
+
+
+def test_depth_above_a_height_is_omitted():
+    """A wall 10 m ahead, from a camera at 1.5 m with f = 48 px: a row 9.6 px above the middle shows 3.5 m above the ground."""
+    camera, settings = camera_of(80, 60), PointSettings(columns=80)
+    blocks = blocks_of(np.full((60, 80), 10.0, np.float32), camera, settings, noise=1e-4)
+    limited = below(blocks, R_BODY_OPTICAL, 1.5, 3.5)
+    row = np.arange(60)
+    above_m = 1.5 - 10.0 * (row - camera.cy) / camera.fy
+    assert np.array_equal(limited.z_m[:, 40] > 0, above_m <= 3.5)
+    assert (limited.z_m[limited.z_m > 0] == 10.0).all()
+    assert limited.z_m.dtype == np.float32
+    assert (blocks.z_m == 10.0).all()
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.floats(0.2, 4.0), st.floats(0.0, 20.0), st.floats(-0.3, 0.3))
+def test_a_limit_keeps_exactly_the_points_below_it(height_m, highest_m, pitch_rad):
+    R = rotation_y(pitch_rad) @ R_BODY_OPTICAL
+    depth = tilted_plane(80, 60)
+    blocks = blocks_of(depth, camera_of(80, 60), ALL, noise=1e-4)
+    limited = below(blocks, R, height_m, highest_m)
+    kept = points_in(limited.z_m, height_m=height_m, R=R)
+    assert (kept.xyz[:, 2] + height_m <= highest_m + 1e-3).all()
+    assert ((limited.z_m == blocks.z_m) | (limited.z_m == 0)).all()
