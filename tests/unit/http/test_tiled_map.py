@@ -168,7 +168,12 @@ def test_a_search_server_that_fails_is_503_and_its_return_mounts_the_map(
     files = {name: (name, data) for name, data in parts_of().items()}
     with FakeQdrant().serving() as fake:
         settings = Settings(
-            maps=(tiled_path.parent,), threads=1, queue=1, qdrant_url=fake.url, qdrant_api_key=SecretStr("a-secret-key")
+            maps=(tiled_path.parent,),
+            threads=1,
+            queue=1,
+            qdrant_url=fake.url,
+            qdrant_api_key=SecretStr("a-secret-key"),
+            qdrant_timeout_s=60,
         )
         with pytest.raises(SearchError, match="is there such a collection"):
             Engine.open(settings)
