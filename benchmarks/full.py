@@ -3,9 +3,8 @@
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
-from scipy.stats import chi2
 
+from benchmarks.coverage import COVERAGE_BAR, SIGMA_GAP_BAR, consistent, sigma_gaps
 from benchmarks.plans import BOTH, more_plan, paper_plan, unseen_plan
 from benchmarks.report import Report
 from benchmarks.runs import Runs, share
@@ -14,8 +13,6 @@ from model_training.evaluation.measures import measure
 from model_training.evaluation.pose_errors import pose_errors
 from model_training.evaluation.predict import Predictions, headings_of, joined
 from service.geometry.rigid import heading_of_camera
-
-COVERAGE_BAR = (0.90, 0.98)
 
 
 def full_paper_rows(report: Report, runs: Runs) -> None:
@@ -103,7 +100,7 @@ def full_unseen_rows(report: Report, runs: Runs) -> None:
         "doubt.sigma_coverage_gap",
         max(gaps.values()),
         "share",
-        bar=0.05,
+        bar=SIGMA_GAP_BAR,
         better="lower",
         why="the worst of those above",
     )
@@ -112,38 +109,3 @@ def full_unseen_rows(report: Report, runs: Runs) -> None:
 def _numbered(answers: Predictions) -> list[str]:
     """Return placeholder names for the streets; they are not shown."""
     return [str(number) for number in range(1 + int(max(answers.street_true.max(), answers.street_answer.max())))]
-
-
-def consistent(errors: NDArray[np.float64], covariances: NDArray[np.float64]) -> float:
-    """Return the share of normalised squared errors between the 2.5 % and 97.5 % quantiles of chi-square.
-
-    Args:
-        errors: errors (n, d).
-        covariances: covariances (n, d, d) of the errors.
-    """
-    squared = np.einsum("ni,nij,nj->n", errors, np.linalg.inv(covariances), errors)
-    low, high = (float(chi2.ppf(quantile, errors.shape[1])) for quantile in (0.025, 0.975))
-    return float(((squared >= low) & (squared <= high)).mean())
-
-
-def sigma_gaps(
-    heading: NDArray[np.float64], errors: NDArray[np.float64], covariances: NDArray[np.float64]
-) -> dict[str, float]:
-    """Return, per axis, the largest difference of 1, 2 and 3 sigma coverage from the normal distribution.
-
-    Queries look along their street within 15 degrees, so the camera's heading stands for the street's.
-
-    Args:
-        heading: true heading of each camera, radians (n,).
-        errors: errors (n, 6) of ``pose_errors``.
-        covariances: covariances (n, 6, 6).
-    """
-    axes = np.zeros((4, len(heading), 6))
-    axes[0, :, 0], axes[0, :, 1] = np.cos(heading), np.sin(heading)
-    axes[1, :, 0], axes[1, :, 1] = -np.sin(heading), np.cos(heading)
-    axes[2, :, 2], axes[3, :, 5] = 1.0, 1.0
-    found = {}
-    for name, axis in zip(("along", "across", "up", "heading"), axes, strict=True):
-        sigmas = np.abs((axis * errors).sum(axis=1)) / np.sqrt(np.einsum("ni,nij,nj->n", axis, covariances, axis))
-        found[name] = max(abs(float((sigmas <= k).mean()) - p) for k, p in ((1, 0.683), (2, 0.954), (3, 0.997)))
-    return found

@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from benchmarks.coverage import coverage_rows
 from benchmarks.real.confidence import (
     calibrated_elsewhere_rows,
     confidence_rows,
@@ -25,7 +26,8 @@ from model_training.datasets.dataset import Dataset
 from model_training.evaluation.failures import position_errors
 from model_training.evaluation.measures import recall_at
 from model_training.evaluation.odometry import as_query
-from model_training.evaluation.predict import RANKED, Predictions, predict
+from model_training.evaluation.pose_errors import pose_errors
+from model_training.evaluation.predict import RANKED, Predictions, headings_of, predict
 from model_training.evaluation.stages import stages_of
 from model_training.evaluation.tracks import followed, steps_of
 from model_training.importing.kinds import OpenSettings, open_recording
@@ -103,7 +105,7 @@ def street_rows(report: Report, data: Path, work: Path, drives: tuple[str, ...] 
 
 
 def answer_rows(report: Report, row: str, found: Predictions, *, bars: bool = True) -> None:
-    """Add the rows of a query set: recall, figures by status, and forced figures.
+    """Add the rows of a query set: recall, figures by status, forced figures, and the coverage of the covariances.
 
     Args:
         report: receives the rows.
@@ -118,6 +120,8 @@ def answer_rows(report: Report, row: str, found: Predictions, *, bars: bool = Tr
     report.share(f"{row}.recall_at_1_10m", recall_at(found.ranked_xy, true_xy, 1, within_m=10.0), bar=far)
     limits = (_ANSWERED, _WRONG, _MEDIAN_M) if bars else (None, None, None)
     status_rows(report, row, errors, found.localized, bars=limits)
+    T_answer, T_true = found.T_answer, found.T_true
+    coverage_rows(report, row, pose_errors(T_answer, T_true), found.covariance, headings_of(T_true), bars=bars)
 
 
 def status_rows(

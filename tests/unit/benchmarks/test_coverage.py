@@ -2,7 +2,8 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from benchmarks.full import consistent, sigma_gaps
+from benchmarks.coverage import consistent, coverage_rows, sigma_gaps
+from benchmarks.report import Report
 from service.geometry.rigid import R_BODY_OPTICAL, rotation_z, transform_from
 
 
@@ -92,3 +93,22 @@ def test_gaussian_errors_have_hardly_a_gap(gaps):
     found = gaps(errors, rng.uniform(-180, 180, 6000), covariances)
     assert set(found) == {"along", "across", "up", "heading"}
     assert max(found.values()) < 0.02
+
+
+def test_only_right_answers_have_a_coverage():
+    """Of five queries two are right, with errors of 2.5 and 0 sigma on each axis; one is wrong, one has no truth, one no answer."""
+    errors, covariances = np.zeros((5, 6)), np.tile(0.01 * np.eye(6), (5, 1, 1))
+    errors[0], errors[2, 0], errors[3] = 0.25, 5.0, np.nan
+    covariances[4] = np.nan
+    report = Report("x", "x")
+    coverage_rows(report, "of", errors, covariances, np.zeros(5))
+    rows = {row["id"]: row for row in report.rows}
+    assert rows["of.covariance_95_coverage"]["value"] == 0.0
+    assert rows["of.covariance_95_coverage"]["n"] == rows["of.sigma_coverage_gap"]["n"] == 2
+    assert rows["of.sigma_coverage_gap"]["value"] == pytest.approx(0.454)  # one of two is within two sigma, not 0.954
+
+
+def test_no_right_answer_gives_no_row():
+    report = Report("x", "x")
+    coverage_rows(report, "of", np.full((3, 6), np.nan), np.tile(np.eye(6), (3, 1, 1)), np.zeros(3))
+    assert not report.rows
