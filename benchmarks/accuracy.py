@@ -13,6 +13,7 @@ from pathlib import Path
 from benchmarks.conditions import condition_rows
 from benchmarks.doubt import doubt_rows
 from benchmarks.full import full_paper_rows, full_unseen_rows
+from benchmarks.ground import ground_rows
 from benchmarks.heights import height_rows
 from benchmarks.kitti_registration import kitti_registration_rows
 from benchmarks.kitti_retrieval import retrieve
@@ -190,6 +191,7 @@ def main() -> None:
         "tracks": lambda: track_rows(report, runs),
         "priors": lambda: prior_rows(report, runs),
         "heights": lambda: height_rows(report, runs),
+        "ground": lambda: ground_rows(report, runs),
         "rigs": lambda: rig_rows(report, arguments.encoder, arguments.calibration_work),
         "rig_calibration": lambda: rig_calibration_rows(report, runs),
         "unseen": lambda: unseen_rows(report, runs),

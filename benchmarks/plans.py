@@ -9,6 +9,8 @@ HARD_COUNT, SEQUENCES, SEQUENCE = 500, 300, 5
 LARGE_M = (600.0, 400.0)
 #: Heights of the camera, metres; queries of each (with each depth camera), and extent of their city.
 HEIGHTS_M, HEIGHT_COUNT, HEIGHT_CITY_M = (0.2, 0.4, 0.8, 1.5, 2.5, 3.5), 100, (300.0, 200.0)
+#: Height of the camera on unusual ground, metres; slope of the ramp, and pitch of a camera that looks down steeply, degrees.
+GROUND_CAMERA_M, RAMP_DEG, STEEP_DEG = 1.5, 8.0, 20.0
 #: Frames of a robot that is followed, the distance between them, robots with each depth camera, and the extent of their city.
 TRACK_FRAMES, TRACK_STEP_M, TRACKS, TRACK_CITY_M = 8, 2.0, 40, (250.0, 300.0)
 REPEATING_DRIVES = 4  # of 120 sequences each; a sixth of them pass a landmark
@@ -85,6 +87,16 @@ def height_plan(height_m: float) -> SimulationPlan:
         camera_height_m=height_m,
         queries=queries,
     )
+
+
+def ground_plan() -> SimulationPlan:
+    """Plan queries in the city of ``height_plan``: a level camera, one that looks up by the slope of a ramp, and one that looks down."""
+    queries = (
+        QueryPlan(name="level", traversal=62, count=2 * HEIGHT_COUNT),
+        QueryPlan(name="ramp", traversal=63, count=2 * HEIGHT_COUNT, pitch_deg=-RAMP_DEG),
+        QueryPlan(name="steep", traversal=64, count=2 * HEIGHT_COUNT, pitch_deg=STEEP_DEG),
+    )
+    return height_plan(GROUND_CAMERA_M).model_copy(update={"name": "ground", "queries": queries})
 
 
 def lidar_16_plan() -> SimulationPlan:

@@ -16,3 +16,6 @@ LEAST_HEIGHT_M, MOST_HEIGHT_M = 0.05, 30.0
 LEAST_HEIGHT_STD_M, MOST_HEIGHT_STD_M, HEIGHT_STD_M = 0.005, 2.0, 0.05
 #: Standard deviation of a height that follows from the camera's pose on the vehicle, metres: tyres, suspension and load.
 VEHICLE_HEIGHT_STD_M = 0.1
+#: Limits of the standard deviations of odometry: per axis, metres and degrees.
+LEAST_ODOMETRY_STD_M, MOST_ODOMETRY_STD_M = 1e-4, 100.0
+LEAST_ODOMETRY_STD_DEG, MOST_ODOMETRY_STD_DEG = 1e-3, 180.0

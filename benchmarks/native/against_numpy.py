@@ -124,11 +124,11 @@ def _of_registration(localizer: Localizer, cloud: SurfelMap, query: Query) -> di
     picture, raycaster = measured[0].picture, SurfelRaycaster(cloud, settings.rays)
     pose = rays._State(starts[0].R_map_level, starts[0].camera_m - cloud.origin_m, 0.0, 0.0)
     T, camera = pose.camera_of(picture), picture.camera
-    hits, near = raycaster.intersect(T, camera), raycaster._collections[0]
-    _require_same((hits,), (plain.intersect(near.surfels, near.numbers, T, camera, settings.rays),))
-    adjusted = rays._normal_equations(cloud, [picture], [hits], pose, settings.rays)
-    surfels = cloud.unpacked(np.maximum(hits.ravel(), 0)).reshape(hits.shape)
-    expected = plain.normal_equations(surfels, picture, hits, T, settings.rays)
+    hits, near = rays._Hits.of(raycaster, pose, picture), raycaster._collections[0]
+    _require_same((hits.indices,), (plain.intersect(near.surfels, near.numbers, T, camera, settings.rays),))
+    adjusted = rays._normal_equations([picture], [hits], pose, settings.rays)
+    surfels = hits.surfels.reshape(hits.indices.shape)
+    expected = plain.normal_equations(surfels, picture, hits.indices, T, settings.rays)
     np.testing.assert_allclose(adjusted.H, expected, rtol=1e-6, atol=1e-9 * np.abs(expected).max())
     return {
         "kernel.py: one step of all starts": _both(
@@ -139,8 +139,8 @@ def _of_registration(localizer: Localizer, cloud: SurfelMap, query: Query) -> di
             lambda: plain.intersect(near.surfels, near.numbers, T, camera, settings.rays),
         ),
         "rays.py: one step of the adjustment": _both(
-            lambda: rays._normal_equations(cloud, [picture], [hits], pose, settings.rays),
-            lambda: plain.normal_equations(surfels, picture, hits, T, settings.rays),
+            lambda: rays._normal_equations([picture], [hits], pose, settings.rays),
+            lambda: plain.normal_equations(surfels, picture, hits.indices, T, settings.rays),
         ),
     }
 

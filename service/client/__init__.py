@@ -12,6 +12,7 @@ from service.client.retry import RetryPolicy
 from service.contract.schema import (
     LocalizeAnswer,
     MapEntry,
+    OdometryStd,
     Options,
     Pose,
     Prior,
@@ -48,6 +49,7 @@ __all__ = [
     "MapEntry",
     "NoAnswerInTimeError",
     "NotLocalizedError",
+    "OdometryStd",
     "Options",
     "PinholeCamera",
     "Pose",

@@ -164,9 +164,16 @@ def _pair(request: schema.LocalizeRequest, pictures: tuple[bytes, bytes]) -> pb.
         options=_options(request.options),
         prior=_prior(request.prior),
         vehicle_base_on_ground=request.vehicle_base_on_ground,
-        track=None
-        if request.track is None
-        else pb.Track(belief=request.track.belief, previous_from_camera=_transform(request.track.T_previous_camera)),
+        track=None if request.track is None else _track(request.track),
+    )
+
+
+def _track(track: schema.Track) -> pb.Track:
+    std = track.odometry_std
+    return pb.Track(
+        belief=track.belief,
+        previous_from_camera=_transform(track.T_previous_camera),
+        odometry_std=None if std is None else pb.OdometryStd(position_m=std.position_m, angle_deg=std.angle_deg),
     )
 
 

@@ -30,10 +30,13 @@ class Track:
         before: the answer to the query before.
         T_previous_camera: (4, 4), pose of this camera in the frame of the previous query's camera, from odometry, metres.
             None: the odometry is unknown, and the track begins again.
+        odometry_std: standard deviations of ``T_previous_camera``. None: 3 % of the distance plus 0.02 m, and 3 % of the angle plus
+            0.2 degrees.
     """
 
     before: schema.LocalizeAnswer | None = None
     T_previous_camera: NDArray[Any] | None = None
+    odometry_std: schema.OdometryStd | None = None
 
 
 class RequestOptions(TypedDict, total=False):
@@ -297,7 +300,9 @@ def _track(track: Track | None) -> dict[str, Any]:
             field="track.before",
         )
     T = _transform(track.T_previous_camera, "track.T_previous_camera")
-    return {"track": {"belief": None if belief is None else belief.token, "T_previous_camera": T}}
+    content = {"belief": None if belief is None else belief.token, "T_previous_camera": T}
+    # An earlier service does not know odometry_std, so it is sent only if it is set.
+    return {"track": content | ({} if track.odometry_std is None else {"odometry_std": track.odometry_std})}
 
 
 def _camera(camera: Camera) -> dict[str, Any]:

@@ -28,7 +28,6 @@ _NEAREST = 5  # number of the most similar neighbours in ``pose_spread``
 _MOST_MARGIN = 12.0  # nats; largest margin, also used if there is no rival
 _MOST_PLACE_M = 10.0
 _LONE_ADVANTAGE = 0.3  # a typical value of right answers
-_LEAST_MAPPED = 0.05
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,11 +60,6 @@ class Evidence:
         """Statistics of the reference's view along its optical axis."""
         views = self.frames[0].views
         return shape_of(views.planes[int(np.argmin(np.abs(views.turns_rad))), 0], self.grid)
-
-    @property
-    def mapped_share(self) -> float:
-        """Share of the points where the map shows a surface from the best pose, at least ``_LEAST_MAPPED``."""
-        return max(1.0 - self.best.scores["unmapped"], _LEAST_MAPPED)
 
     @cached_property
     def support_gaps(self) -> Float64[NDArray[np.float64], " C"]:
@@ -150,7 +144,7 @@ TABLE: tuple[Feature, ...] = (
             lambda e: float(e.support_gaps[1:].min(initial=_MOST_MARGIN)), rivalry=True, ideal=True),
     Feature("inliers", "1", "share of the points that lie on the map", 1, lambda e: e.best.registered.inliers, weighted=False),
     Feature("mapped_inliers", "1", "the same, relative to the share where the map shows a surface", 1,
-            lambda e: e.best.registered.inliers / e.mapped_share, ideal=True),
+            lambda e: e.best.mapped_inliers, ideal=True),
     Feature("similarity", "1", "descriptor similarity to the places around the pose", 1,
             lambda e: e.best.scores["similarity"], weighted=False),
     Feature("similarity_margin", "1", "similarity at the pose minus the best similarity elsewhere", 1,
@@ -158,9 +152,9 @@ TABLE: tuple[Feature, ...] = (
     Feature("likelihood", "nat", "mean log likelihood of the rendered depth", 1, lambda e: e.best.scores["likelihood"],
             weighted=False),
     Feature("through", "1", "share of the mapped points behind the map's surfaces", -1,
-            lambda e: e.best.scores["through"] / e.mapped_share, ideal=True),
+            lambda e: e.best.scores["through"] / e.best.mapped_share, ideal=True),
     Feature("front", "1", "share of the mapped points in front of the map's surfaces", -1,
-            lambda e: e.best.scores["front"] / e.mapped_share, weighted=False, ideal=True),
+            lambda e: e.best.scores["front"] / e.best.mapped_share, weighted=False, ideal=True),
     Feature("shared_edges", "1", "share of the depth edges of image and map that the other one has too", 1,
             lambda e: e.best.scores["shared_edges"], weighted=False),
     Feature("upper_inliers", "1", "share of the points above vehicles and people that lie on the map", 1,

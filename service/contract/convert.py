@@ -27,7 +27,7 @@ from service.geometry.rigid import (
 from service.geometry.uncertainty import covariance_at
 from service.imaging.level import GivenHeight
 from service.localization.answer import Answer
-from service.localization.belief import Belief
+from service.localization.belief import Belief, OdometryStd
 from service.localization.localizer import Localizer
 from service.maps.map import Map
 from service.option_limits import LEAST_HEIGHT_M, MOST_HEIGHT_M, VEHICLE_HEIGHT_STD_M
@@ -117,7 +117,28 @@ def _track(track: schema.Track) -> CarriedTrack:
     return CarriedTrack(
         None if track.belief is None else _token_bytes(track.belief),
         None if T is None else transform_of(T, "track.T_previous_camera"),
+        odometry_std_of(track.odometry_std, "track.odometry_std", known=T is not None),
     )
+
+
+def odometry_std_of(std: schema.OdometryStd | None, field: str, *, known: bool) -> OdometryStd | None:
+    """Return the standard deviations of an odometry step.
+
+    Args:
+        std: as received; None if the client did not send it.
+        field: name of the field, for errors.
+        known: whether the request has the odometry itself.
+
+    Raises:
+        RequestError: it was sent without the odometry.
+    """
+    if std is None:
+        return None
+    if not known:
+        raise RequestError(
+            f"{field}: there is no odometry that it could describe; send the odometry, or omit it", field=field
+        )
+    return OdometryStd(std.position_m, float(np.deg2rad(std.angle_deg)))
 
 
 def _token_bytes(token: str) -> bytes:

@@ -94,7 +94,27 @@ def transform_from(message: pb.RigidTransform) -> schema.RigidTransform:
 
 
 def _track(message: pb.Track) -> dict[str, Any]:
-    return _given(message, "belief") | _sub(message, "previous_from_camera", "T_previous_camera", transform_content)
+    return (
+        _given(message, "belief")
+        | _sub(message, "previous_from_camera", "T_previous_camera", transform_content)
+        | _sub(message, "odometry_std", "odometry_std", _odometry_std)
+    )
+
+
+def _odometry_std(message: pb.OdometryStd) -> dict[str, Any]:
+    return {"position_m": message.position_m, "angle_deg": message.angle_deg}
+
+
+def odometry_std_from(message: pb.OdometryStd) -> schema.OdometryStd:
+    """Convert standard deviations of odometry.
+
+    Args:
+        message: as received.
+
+    Raises:
+        RequestError: a number is invalid.
+    """
+    return checked(_odometry_std(message), schema.OdometryStd)
 
 
 def _of_all(message: pb.LocalizeRequest | pb.LocalizeSequenceRequest) -> dict[str, Any]:

@@ -7,7 +7,15 @@ from time import perf_counter
 
 import grpc
 
-from service.contract.convert import answer_from, fields_under, map_entry_from, query_from, sequence_from, transform_of
+from service.contract.convert import (
+    answer_from,
+    fields_under,
+    map_entry_from,
+    odometry_std_of,
+    query_from,
+    sequence_from,
+    transform_of,
+)
 from service.contract.coverage import coverage_geojson
 from service.contract.schema import MOST_FRAMES
 from service.errors import BusyError, DeadlineError, RequestError, StreetfixError
@@ -17,7 +25,14 @@ from service.grpc.deadline_watchdog import DeadlineWatchdog
 from service.grpc.generated.streetfix.v1 import localization_pb2 as pb
 from service.grpc.generated.streetfix.v1.localization_pb2_grpc import LocalizationServiceServicer
 from service.grpc.memory import MessageMemory
-from service.grpc.messages import answer_message, map_message, request_from, sequence_request_from, transform_from
+from service.grpc.messages import (
+    answer_message,
+    map_message,
+    odometry_std_from,
+    request_from,
+    sequence_request_from,
+    transform_from,
+)
 from service.grpc.status import problem_message
 from service.runtime.engine import Engine, Located
 from service.runtime.stream import Stream
@@ -188,7 +203,12 @@ class Servicer(LocalizationServiceServicer):
                 name = "previous_from_camera"
                 with fields_under(name):
                     odometry = transform_of(transform_from(request.previous_from_camera), name)
-            located, frames = stream.localize(query, odometry)
+            std = None
+            if request.HasField("odometry_std"):
+                with fields_under("odometry_std"):
+                    std = odometry_std_from(request.odometry_std)
+            std_of_step = odometry_std_of(std, "odometry_std", known=odometry is not None)
+            located, frames = stream.localize(query, odometry, std_of_step)
             call.span.stages(located.answer.timings)
             return located, frames
 

@@ -39,6 +39,19 @@ LEAST_PROBABILITY = 1e-4
 AGREES_M, AGREES_RAD, MOST_AGREES_M = 1.0, float(np.deg2rad(15.0)), 10.0
 
 
+@dataclass(frozen=True, slots=True)
+class OdometryStd:
+    """Standard deviations of one odometry step, equal in all directions.
+
+    Attributes:
+        position_m: of the translation along each axis, m.
+        angle_rad: of the rotation about each axis, rad.
+    """
+
+    position_m: float
+    angle_rad: float
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class FrameCandidate:
     """A candidate of one frame.
@@ -114,18 +127,21 @@ class Belief:
     outside: float = 0.5
     born: int = 0
 
-    def moved(self, T_previous_camera: Transform, *, kidnapped: float | None = None) -> "Belief":
+    def moved(
+        self, T_previous_camera: Transform, *, std: OdometryStd | None = None, kidnapped: float | None = None
+    ) -> "Belief":
         """Return the belief after a motion.
 
         Args:
             T_previous_camera: odometry, from this camera's frame to the previous camera's frame, metres.
+            std: standard deviations of the odometry. None: they follow from the size of the motion (``ODOMETRY_STD``).
             kidnapped: probability that the odometry missed a displacement. Then the robot is in the map or outside, equally likely.
                 None: it follows from the size of the motion.
         """
         if kidnapped is None:
             kidnapped = KIDNAPPED + KIDNAPPED_ON_THE_WAY * _news_of(T_previous_camera)
         stays = 1.0 - kidnapped
-        modes = tuple(replace(moved(mode, T_previous_camera), weight=stays * mode.weight) for mode in self.modes)
+        modes = tuple(replace(moved(mode, T_previous_camera, std), weight=stays * mode.weight) for mode in self.modes)
         elsewhere, outside = (stays * each + kidnapped / 2 for each in (self.elsewhere, self.outside))
         return replace(self, modes=modes, elsewhere=elsewhere, outside=outside)
 
@@ -227,26 +243,28 @@ def sighting_of(
     return Sighting(seen, known - float(each.sum()), 1.0 - known)
 
 
-def _motion_covariance(T_previous_camera: Transform) -> Float64[NDArray[np.float64], "6 6"]:
-    """Return the covariance of an odometry step: equal in all directions."""
+def _usual_std(T_previous_camera: Transform) -> OdometryStd:
+    """Return the standard deviations of an odometry step of this size."""
     share, least_m, angle_share, least_rad = ODOMETRY_STD
     distance_m, angle = size_of(T_previous_camera)
     moving = min(1.0, distance_m / least_m + angle / least_rad)
-    position, rotation = moving * least_m + share * distance_m, moving * least_rad + angle_share * angle
-    return np.diag([position**2] * 3 + [rotation**2] * 3)
+    return OdometryStd(moving * least_m + share * distance_m, moving * least_rad + angle_share * angle)
 
 
-def moved(mode: Mode, T_previous_camera: Transform) -> Mode:
+def moved(mode: Mode, T_previous_camera: Transform, std: OdometryStd | None = None) -> Mode:
     """Return a mode after a motion, with the same weight.
 
     Args:
         mode: the mode.
         T_previous_camera: odometry, from this camera's frame to the previous camera's frame, metres.
+        std: standard deviations of the odometry. None: they follow from the size of the motion (``ODOMETRY_STD``).
     """
     T = nearest_rigid(mode.T_map_camera @ T_previous_camera)
     carried = covariance_at(mode.covariance, mode.T_map_camera[:3, 3], T[:3, 3])
     news = min(1.0, mode.news + _news_of(T_previous_camera))
-    return replace(mode, T_map_camera=T, covariance=carried + _motion_covariance(T_previous_camera), news=news)
+    std = std or _usual_std(T_previous_camera)
+    motion = np.diag([std.position_m**2] * 3 + [std.angle_rad**2] * 3)
+    return replace(mode, T_map_camera=T, covariance=carried + motion, news=news)
 
 
 def _news_of(T_previous_camera: Transform) -> float:

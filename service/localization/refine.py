@@ -11,23 +11,27 @@ from service.maps.map import Map
 from service.registration.covariance import (
     OF_POINTS,
     OF_RAYS,
+    Stability,
     covariance_of,
     rectification_covariance,
+    relative_pose_covariance,
     score_outer_product,
     survey_covariance,
     variance_inflation,
 )
+from service.registration.kernel import QueryPoints
 from service.registration.local_search import LocalSearchSettings, search_locally
 from service.registration.points import FOCAL_BASELINE_PX_M, PointSettings
 from service.registration.rays import RaySettings, adjust
-from service.registration.register import RegistrationSettings, Start, register
+from service.registration.register import Registered, RegistrationSettings, Start, register
+from service.registration.restarts import RestartSettings, difference, spread_of_restarts
 from service.registration.surfel_tiles import Cloud
 from service.registration.visibility import Raycasters
 from service.retrieval.prior import Prior
 from service.retrieval.retrieve import EncodedFrame
 from service.retrieval.starts import StartSettings, starts_from
 from service.scoring.candidates import Candidate, Refined
-from service.scoring.confirmation import confirm
+from service.scoring.confirmation import Confirmation, confirm
 from service.scoring.measured import MeasuredFrame, measure, merged_points
 from service.scoring.photometry import BrightnessScorer, PhotometrySettings
 from service.scoring.similarity import similarity_of
@@ -49,6 +53,7 @@ class RefineSettings:
         around: settings of the local search around the best candidate.
         near: weights for the choice among poses of the local search.
         rays: settings of the ray adjustment.
+        restarts: settings of the restarted ray adjustments, for the covariance.
         photometry: settings of the brightness comparison.
     """
 
@@ -61,6 +66,7 @@ class RefineSettings:
     around: LocalSearchSettings = field(default_factory=LocalSearchSettings)
     near: LocalScoreWeights = field(default_factory=LocalScoreWeights)
     rays: RaySettings = field(default_factory=RaySettings)
+    restarts: RestartSettings = field(default_factory=RestartSettings)
     photometry: PhotometrySettings = field(default_factory=PhotometrySettings)
 
 
@@ -147,22 +153,16 @@ def refine(
             cloud, points, candidates[0].registered, reference.views.height_m, settings.registration, settings.around
         )
         candidates[0] = scorer.select_local_optimum(candidates[0], near)
-    # 4. Adjustment of the best pose along the rays, its covariance, and its comparison with poses next to it.
-    best = candidates[0].registered
-    adjusted = adjust(raycasters.at(best.camera_m), [each.picture for each in measured], best, settings.rays)
-    if adjusted is None:
-        scatter, model = score_outer_product(cloud.at(best.camera_m), points, best, settings.registration), OF_POINTS
-    else:
-        (best, scatter), model = adjusted, OF_RAYS
-        T_map_camera = transform_from(best.R_map_level @ reference.R_level_camera, best.camera_m)
-        candidates[0] = replace(candidates[0], T_map_camera=T_map_camera, registered=best)
+    # 4. Adjustment of the best pose along the rays, its comparison with poses next to it, and its covariance.
     noise = float(np.median([frame.noise for frame in frames]))
-    heading = heading_of_camera(candidates[0].T_map_camera)
-    of_registration = covariance_of(best.information, scatter, noise, heading, model)
-    systematic = survey_covariance(*bundle.manifest.survey_std)
+    final = _adjusted(cloud, raycasters, scorer, points, candidates[0], noise, settings)
+    systematic = survey_covariance(*bundle.manifest.survey_std) + relative_pose_covariance(len(frames))
     if reference.query.baseline_m is not None:
         systematic = systematic + rectification_covariance(reference.views.height_m, reference.query.baseline_m)
-    candidates[0] = replace(candidates[0], covariance=of_registration + systematic)
+    covariance = final.covariance + systematic
+    candidates[0] = replace(
+        candidates[0], T_map_camera=final.T_map_camera, registered=final.pose, covariance=covariance
+    )
 
     def covariance_at(candidate: Candidate) -> Float64[NDArray[np.float64], "6 6"]:
         pose = candidate.registered
@@ -172,13 +172,60 @@ def refine(
 
     return Refined(
         candidates=tuple(candidates),
-        covariance=of_registration + systematic,
-        registration_covariance=of_registration,
+        covariance=covariance,
+        registration_covariance=final.covariance,
         points=len(points),
-        variance_inflation=variance_inflation(best.information, scatter),
-        confirmation=confirm(cloud, scorer.structure, best),
+        variance_inflation=variance_inflation(final.pose.information, final.scatter),
+        confirmation=final.confirmation,
         covariance_at=covariance_at,
     )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Adjusted:
+    """The final pose, the scatter of its patches' gradients, its comparison with poses next to it, and its covariance.
+
+    The covariance does not contain the errors of the survey and of a stereo pair's rectification.
+    """
+
+    pose: Registered
+    T_map_camera: Transform
+    scatter: Float64[NDArray[np.float64], "8 8"]
+    confirmation: Confirmation
+    covariance: Float64[NDArray[np.float64], "6 6"]
+
+
+def _adjusted(
+    cloud: Cloud,
+    raycasters: Raycasters,
+    scorer: PoseScorer,
+    points: QueryPoints,
+    candidate: Candidate,
+    noise: float,
+    settings: RefineSettings,
+) -> _Adjusted:
+    """Adjust the pose of a candidate along the rays. If too few rays intersect the map, it stays the pose of the points."""
+    found, pictures = candidate.registered, [each.picture for each in scorer.measured]
+    raycaster = raycasters.at(found.camera_m)
+    adjusted = adjust(raycaster, pictures, found, settings.rays)
+    if adjusted is None:
+        pose = found
+        scatter = score_outer_product(cloud.at(pose.camera_m), points, pose, settings.registration)
+    else:
+        pose, scatter = adjusted
+    T_map_camera = transform_from(pose.R_map_level @ scorer.measured[0].frame.R_level_camera, pose.camera_m)
+    heading, confirmation = heading_of_camera(T_map_camera), confirm(cloud, scorer.structure, pose)
+    if adjusted is None:
+        covariance = covariance_of(pose.information, scatter, noise, heading, OF_POINTS)
+    else:
+        stability = Stability(
+            restarts=spread_of_restarts(raycaster, pictures, pose, heading, settings.rays, settings.restarts),
+            shift=difference(pose.T_map_level, found.T_map_level),
+            mapped_inliers=candidate.mapped_inliers,
+            along_residual=confirmation.along_residual,
+        )
+        covariance = covariance_of(pose.information, scatter, noise, heading, OF_RAYS, stability)
+    return _Adjusted(pose, T_map_camera, scatter, confirmation, covariance)
 
 
 def _starts_at(

@@ -9,7 +9,7 @@ from service.confidence.decision import Decision
 from service.geometry.rigid import Transform, inverse, nearest_rigid
 from service.localization.agreement import PREDICTED, agreed, frame_candidate_of, is_likely, updated_belief
 from service.localization.answer import Answer, require_finite
-from service.localization.belief import Belief, Mode, agrees, moved, size_of
+from service.localization.belief import Belief, Mode, OdometryStd, agrees, moved, size_of
 from service.localization.compose import QueryResult
 from service.localization.localizer import Localizer
 from service.retrieval.retrieve import EncodedFrame
@@ -47,7 +47,11 @@ class Track:
 
 @timed_request()
 def follow(
-    localizer: Localizer, frame: EncodedFrame, track: Track, T_previous_camera: Transform | None
+    localizer: Localizer,
+    frame: EncodedFrame,
+    track: Track,
+    T_previous_camera: Transform | None,
+    odometry_std: OdometryStd | None = None,
 ) -> tuple[Answer, Track]:
     """Answer the next frame of a robot.
 
@@ -63,6 +67,7 @@ def follow(
         track: of the frames before; ``Track()`` begins.
         T_previous_camera: odometry, from this camera's frame to the previous camera's frame, metres. None: unknown; the track begins
             again.
+        odometry_std: standard deviations of the odometry. None: they follow from the size of the motion.
 
     Returns:
         The answer with its ``belief`` and ``epoch``, and the track for the next frame.
@@ -78,8 +83,8 @@ def follow(
         kept = tuple(
             replace(each, T_reference_camera=nearest_rigid(back @ each.T_reference_camera)) for each in track.frames
         )
-        belief = track.belief.moved(T_previous_camera)
-        last = None if track.last is None else moved(track.last, T_previous_camera)
+        belief = track.belief.moved(T_previous_camera, std=odometry_std)
+        last = None if track.last is None else moved(track.last, T_previous_camera, odometry_std)
     bundle = localizer.bundle
     is_calibrated = bundle.cloud is not None and bundle.calibration is not None
     if not frame.query.refine or not is_calibrated:  # the frame has no probability

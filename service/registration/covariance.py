@@ -31,23 +31,32 @@ _LEAST = 1e-6
 class CovarianceModel:
     """Inflation factors of the covariance.
 
-    Each factor multiplies standard deviations. Decision 0037 explains the two parts of the covariance.
+    Each factor multiplies standard deviations. Decision 0037 explains the first two parts of the covariance, decision 0179 the others.
 
     Attributes:
-        independent: factor of the part with independent errors, at ``AT_NOISE``.
-        independent_power: exponent of (noise / ``AT_NOISE``) in that factor.
         shared: factor of the part with errors that the pixels of a patch share.
         axes: six factors at ``AT_NOISE``: along the view, across it, height, and rotations about these axes (roll, pitch, heading).
         axes_power: exponents of (noise / ``AT_NOISE``) in the factors ``axes``.
         floor: least standard deviations: x, y, z (m), roll, pitch, heading (degrees).
+        independent: factor of the part with independent errors, at ``AT_NOISE``; 0 omits this part.
+        independent_power: exponent of (noise / ``AT_NOISE``) in that factor.
+        restarts: factor of the spread of restarted adjustments.
+        shift: factor of the shift from the pose of the points to that of the rays.
+        misfit: factors of the logarithm of the variance inflation, of the share of mapped points that are no inliers, and of the along
+            residual. They scale the standard deviations above the floor: exp of their sum.
+        usual: values of these three numbers at which the scale is 1.
     """
 
-    independent: float
-    independent_power: float
     shared: float
     axes: tuple[float, ...]
     axes_power: tuple[float, ...]
     floor: tuple[float, ...]
+    independent: float = 0.0
+    independent_power: float = 0.0
+    restarts: float = 0.0
+    shift: float = 0.0
+    misfit: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    usual: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
 
 #: Model for poses that ``register`` found from points. Fitted on calibration cities (decisions 0042 and 0081).
@@ -59,15 +68,19 @@ OF_POINTS = CovarianceModel(
     axes_power=(0.0, 0.0, -0.3, -0.22, -0.22, 0.03),
     floor=(0.025, 0.025, 0.017, 0.03, 0.03, 0.05),
 )
-#: Model for poses that ``adjust`` refined along the rays. Fitted on calibration cities (decisions 0098 and 0100).
+#: Model for poses that ``adjust`` refined along the rays. Fitted on the rig families of the calibration (decision 0179).
 OF_RAYS = CovarianceModel(
-    independent=1.17,
-    independent_power=0.52,
-    shared=2.97,
-    axes=(1.42, 0.91, 0.73, 0.8, 0.8, 1.05),
-    axes_power=(0.05, 0.0, -0.18, -0.22, -0.22, -0.04),
-    floor=(0.022, 0.022, 0.0175, 0.028, 0.028, 0.01),
+    shared=3.8,
+    axes=(1.05, 0.77, 0.72, 0.48, 0.88, 0.7),
+    axes_power=(0.0, 0.0, 0.0, 0.0, -0.23, 0.14),
+    floor=(0.01, 0.01, 0.01, 0.02, 0.03, 0.05),
+    restarts=0.44,
+    shift=0.36,
+    misfit=(0.2, 0.37, -0.24),
+    usual=(-0.48, 0.23, 1.56),
 )
+#: Limits of the scale by ``CovarianceModel.misfit``: exp of plus and minus this number.
+_MOST_MISFIT = 1.5
 
 
 #: Standard deviations of a survey's poses that the floors of the models above contain: position (m) and angle (degrees).
@@ -111,12 +124,44 @@ def rectification_covariance(height_m: float, baseline_m: float) -> Float64[NDAr
     return np.diag(np.deg2rad([0, 0, 0, tilt_deg, tilt_deg, 0]) ** 2)
 
 
+#: Standard deviation of a rotation from the relative poses of several frames, degrees. Odometry and the mounts of several cameras have
+#: such errors, and the frames cannot show them. Measured on sequences of five frames and on four cameras (decision 0179).
+RELATIVE_POSES_DEG = 0.17
+
+
+def relative_pose_covariance(frames: int) -> Float64[NDArray[np.float64], "6 6"]:
+    """Return the covariance that the relative poses of a query's frames add: translation (m), then rotation (rad).
+
+    Args:
+        frames: number of frames; a single frame adds nothing.
+    """
+    return np.diag([0, 0, 0, 1, 1, 1]) * (np.deg2rad(RELATIVE_POSES_DEG) ** 2 if frames > 1 else 0.0)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Stability:
+    """How stable a pose of the ray adjustment is, and how well the map explains the image there.
+
+    Attributes:
+        restarts: spread of restarted adjustments, as ``spread_of_restarts`` returns it: translation (m), rotation (rad), map axes.
+        shift: difference of the pose to the pose of the points, which the adjustment began with, in the same order.
+        mapped_inliers: share of the points on the map, relative to the share where the map shows a surface.
+        along_residual: how many times larger the mean depth residual is 2 m further along the street.
+    """
+
+    restarts: Float64[NDArray[np.float64], "6 6"]
+    shift: Float64[NDArray[np.float64], "6"]
+    mapped_inliers: float
+    along_residual: float
+
+
 def covariance_of(
     information: Float64[NDArray[np.float64], "8 8"],
     scatter: Float64[NDArray[np.float64], "8 8"],
     noise: float,
     heading_rad: float,
     model: CovarianceModel,
+    stability: Stability | None = None,
 ) -> Float64[NDArray[np.float64], "6 6"]:
     """Compute the covariance of a pose: translation (m), then rotation (rad), in map axes about the camera's centre.
 
@@ -124,24 +169,39 @@ def covariance_of(
     The second part is the inverse of the information after division by the squared factor ``independent``.
     Scale and disparity offset are marginalised.
 
+    A pose of the ray adjustment adds the spread of its restarts (Brossard and others, RA-L 5, 2020) and the outer product of its shift.
+    The sum grows with the misfit of image and map.
+
     Args:
         information: of the measurements, without priors. Order: translation (m), rotation (rad), log scale, disparity offset (px).
         scatter: scatter of the patches' gradients in the same order, as ``score_outer_product`` or ``adjust`` returns it.
         noise: standard deviation of one pixel's inverse depth, 1/m.
         heading_rad: heading of the view in the map frame, rad.
         model: ``OF_POINTS`` or ``OF_RAYS``, as the pose was found.
+        stability: of a pose of the ray adjustment; None for a pose of the points.
     """
     ratio = float(np.clip(noise, LEAST, MOST)) / AT_NOISE
     prior = np.diag(_PRIOR_SIGMA**-2.0)
     bread = np.linalg.inv(information + prior)
-    shared = model.shared**2 * bread @ scatter @ bread
-    independent = np.linalg.inv(information / (model.independent * ratio**model.independent_power) ** 2 + prior)
+    parts = model.shared**2 * bread @ scatter @ bread
+    if model.independent > 0:
+        parts += np.linalg.inv(information / (model.independent * ratio**model.independent_power) ** 2 + prior)
     to_map = np.kron(np.eye(2), rotation_z(heading_rad))
     stretch = to_map @ np.diag(np.array(model.axes) * ratio ** np.array(model.axes_power)) @ to_map.T
+    pose = stretch @ parts[:6, :6] @ stretch
+    if stability is not None:
+        pose += model.restarts**2 * stability.restarts + model.shift**2 * np.outer(stability.shift, stability.shift)
+        pose *= _misfit_scale(model, variance_inflation(information, scatter), stability) ** 2
     floor = np.array([*model.floor[:3], *np.deg2rad(model.floor[3:])])
-    pose = stretch @ (shared + independent)[:6, :6] @ stretch
     symmetric: Float64[NDArray[np.float64], "6 6"] = 0.5 * (pose + pose.T) + np.diag(floor**2)
     return symmetric
+
+
+def _misfit_scale(model: CovarianceModel, inflation: float, stability: Stability) -> float:
+    """Return the factor of the standard deviations for a misfit of image and map; 1 at its usual size."""
+    misfit = np.array([np.log(inflation), 1.0 - stability.mapped_inliers, stability.along_residual])
+    exponent = float((misfit - model.usual) @ model.misfit)
+    return float(np.exp(np.clip(exponent, -_MOST_MISFIT, _MOST_MISFIT)))
 
 
 def score_outer_product(

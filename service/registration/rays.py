@@ -14,6 +14,7 @@ import ctypes
 from ctypes import POINTER, Structure, byref, c_double, c_int64, c_void_p
 from dataclasses import dataclass, replace
 from functools import cache
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int32
@@ -57,8 +58,8 @@ class RaySettings(DiscSettings):
         fewest: least number of pixels that intersect the map. With fewer the pose is not adjusted.
     """
 
-    rounds: int = 5
-    steps: int = 2
+    rounds: int = 10
+    steps: int = 1
     converged_m: float = 0.02
     converged_rad: float = 1e-3
     surface_m: float = 0.05
@@ -102,6 +103,25 @@ class RayPicture:
     noise: float
     focal_baseline_px_m: float | None
     movable: Bool[NDArray[np.bool_], "H W"]
+
+    def thinned(self, each: int) -> "RayPicture":
+        """Return the image of every n-th row and column, the first ones included.
+
+        Args:
+            each: n.
+        """
+        camera = self.camera
+        thinned = replace(
+            camera,
+            width=-(-camera.width // each),
+            height=-(-camera.height // each),
+            fx=camera.fx / each,
+            fy=camera.fy / each,
+            cx=camera.cx / each,
+            cy=camera.cy / each,
+        )
+        rows = np.s_[::each, ::each]
+        return replace(self, inverse=self.inverse[rows].copy(), camera=thinned, movable=self.movable[rows].copy())
 
 
 def picture_of(
@@ -168,6 +188,19 @@ class _State:
 
 
 @dataclass(frozen=True, slots=True)
+class _Hits:
+    """The surfels that the rays of an image intersect: index of each pixel's surfel, -1 for none, and the surfels (H W,)."""
+
+    indices: Int32[NDArray[np.int32], "H W"]
+    surfels: NDArray[Any]
+
+    @classmethod
+    def of(cls, raycaster: SurfelRaycaster, state: _State, picture: RayPicture) -> "_Hits":
+        indices = raycaster.intersect(state.camera_of(picture), picture.camera)
+        return cls(indices, raycaster.cloud.unpacked(np.maximum(indices.ravel(), 0)))
+
+
+@dataclass(frozen=True, slots=True)
 class _NormalEquations:
     """Normal equations of all pixels, scatter of the patches' gradients (0 if not requested), number of pixels used, and error."""
 
@@ -215,18 +248,65 @@ def adjust(
         The pose's ``information`` excludes the priors.
         None if fewer than ``settings.fewest`` pixels intersect the map.
     """
-    cloud, state = raycaster.cloud, _state_of(raycaster.cloud, found)
+    end = _minimised(raycaster, pictures, found, settings)
+    if end is None:
+        return None
+    equations = _normal_equations(pictures, end.hits, end.state, settings, with_scatter=True)
+    pose = replace(
+        found,
+        R_map_level=end.state.R,
+        camera_m=end.state.t + raycaster.cloud.origin_m,
+        scale=float(np.exp(end.state.log_scale)),
+        offset=end.state.offset,
+        information=equations.H,
+        converged=end.converged,
+        iterations=end.iterations,
+        error=equations.error,
+    )
+    return pose, equations.scatter
+
+
+def adjusted_pose(
+    raycaster: SurfelRaycaster, pictures: list[RayPicture], found: Registered, settings: RaySettings
+) -> Transform | None:
+    """Return the pose T_map_level of ``adjust`` alone, without information and scatter; None if too few pixels intersect the map.
+
+    Args:
+        raycaster: ray casting on the map, with the same settings.
+        pictures: images of the query, the reference's first.
+        found: registered pose of the reference's level frame, map frame.
+        settings: of the adjustment.
+    """
+    end = _minimised(raycaster, pictures, found, settings)
+    return None if end is None else transform_from(end.state.R, end.state.t + raycaster.cloud.origin_m)
+
+
+@dataclass(frozen=True, slots=True)
+class _Minimum:
+    """End of the minimisation: the unknowns, the surfels of the last round for each image, whether it converged, and its steps."""
+
+    state: _State
+    hits: list[_Hits]
+    converged: bool
+    iterations: int
+
+
+def _minimised(
+    raycaster: SurfelRaycaster, pictures: list[RayPicture], found: Registered, settings: RaySettings
+) -> _Minimum | None:
+    """Minimise the differences of inverse depths (Gauss and Newton); None if too few pixels intersect the map."""
+    state = _state_of(raycaster.cloud, found)
     free = np.ones(UNKNOWNS, bool)
     free[7] = pictures[0].focal_baseline_px_m is not None
     sigma = np.r_[np.full(3, settings.position_m), np.full(3, settings.turn_rad), settings.scale, settings.offset_px]
     prior, moved = np.diag(sigma**-2.0), np.zeros(UNKNOWNS)
     moved[6:] = state.log_scale, state.offset  # priors of scale and offset: mean 0; of the pose: the start
-    converged, iterations = False, 0
+    converged, iterations, hits = False, 0, list[_Hits]()
     for _ in range(settings.rounds):
         before = moved
-        hits = [raycaster.intersect(state.camera_of(picture), picture.camera) for picture in pictures]
+        hits = [_Hits.of(raycaster, state, picture) for picture in pictures]
         for _ in range(settings.steps):
-            equations = _normal_equations(cloud, pictures, hits, state, settings)
+            equations = _normal_equations(pictures, hits, state, settings)
             if equations.pixels < settings.fewest:
                 return None
             H = equations.H / settings.correlated_pixels + prior
@@ -237,25 +317,12 @@ def adjust(
         change = np.linalg.norm((moved - before)[:6].reshape(2, 3), axis=1)
         if converged := bool(change[0] < settings.converged_m and change[1] < settings.converged_rad):
             break
-    equations = _normal_equations(cloud, pictures, hits, state, settings, with_scatter=True)
-    pose = replace(
-        found,
-        R_map_level=state.R,
-        camera_m=state.t + cloud.origin_m,
-        scale=float(np.exp(state.log_scale)),
-        offset=state.offset,
-        information=equations.H,
-        converged=converged,
-        iterations=iterations,
-        error=equations.error,
-    )
-    return pose, equations.scatter
+    return _Minimum(state, hits, converged, iterations)
 
 
 def _normal_equations(
-    cloud: SurfelMap,
     pictures: list[RayPicture],
-    hits: list[Int32[NDArray[np.int32], "H W"]],
+    hits: list[_Hits],
     state: _State,
     settings: RaySettings,
     *,
@@ -263,7 +330,7 @@ def _normal_equations(
 ) -> _NormalEquations:
     H, b, scatter, pixels = np.zeros((UNKNOWNS, UNKNOWNS)), np.zeros(UNKNOWNS), np.zeros((UNKNOWNS, UNKNOWNS)), 0
     error = c_double(0.0)
-    for picture, surfels in zip(pictures, hits, strict=True):
+    for picture, hit in zip(pictures, hits, strict=True):
         camera, rig = picture.camera, picture.focal_baseline_px_m
         down, across = (-(-side // settings.patch) for side in (camera.height, camera.width))
         gradients = np.zeros((down, across, UNKNOWNS))
@@ -283,11 +350,10 @@ def _normal_equations(
             settings.patch,
         )
         view = View.of(state.camera_of(picture), camera)
-        of_pixels = cloud.unpacked(np.maximum(surfels.ravel(), 0))
         pixels += _library().streetfix_normal_equations(
-            of_pixels.ctypes.data,
+            hit.surfels.ctypes.data,
             byref(view),
-            surfels.ctypes.data,
+            hit.indices.ctypes.data,
             picture.inverse.ctypes.data,
             picture.movable.ctypes.data,
             byref(model),

@@ -141,11 +141,22 @@ class _Collection:
 
     def covers(self, T_map_camera: Transform, camera: PinholeCamera) -> bool:
         """Whether these surfels include all that the camera sees from a pose."""
-        if camera != self.camera or np.linalg.norm(T_map_camera[:3, 3] - self.T_map_camera[:3, 3]) > NEAR_M:
+        near = np.linalg.norm(T_map_camera[:3, 3] - self.T_map_camera[:3, 3]) <= NEAR_M
+        if not near or not _has_rays_within(camera, self.camera):
             return False
         # The trace of a rotation is 1 + 2 cos of its angle.
         cosine = (np.vdot(T_map_camera[:3, :3], self.T_map_camera[:3, :3]) - 1) / 2
         return bool(cosine >= np.cos(NEAR_RAD))
+
+
+def _has_rays_within(inner: PinholeCamera, outer: PinholeCamera) -> bool:
+    """Return whether the rays of all pixels of a camera lie in the image of another camera at the same pose."""
+    return (
+        (0.5 + outer.cx) / outer.fx >= inner.cx / inner.fx
+        and (0.5 + outer.cy) / outer.fy >= inner.cy / inner.fy
+        and (outer.width - 0.5 - outer.cx) / outer.fx >= (inner.width - 1 - inner.cx) / inner.fx
+        and (outer.height - 0.5 - outer.cy) / outer.fy >= (inner.height - 1 - inner.cy) / inner.fy
+    )
 
 
 class SurfelRaycaster:

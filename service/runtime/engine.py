@@ -13,6 +13,7 @@ from service.imaging.decode import DepthEncoding, DepthKind, ImageLimits
 from service.imaging.level import GivenHeight
 from service.imaging.picture_headers import DEFAULT_LIMITS
 from service.localization.answer import Answer
+from service.localization.belief import OdometryStd
 from service.localization.localizer import Localizer
 from service.localization.track_bytes import packed, unpacked
 from service.localization.tracker import Track, follow
@@ -52,10 +53,12 @@ class CarriedTrack:
     Attributes:
         sealed_belief: bytes of the answer before; None begins.
         T_previous_camera: odometry, from this camera's frame to the previous camera's frame, (4, 4), metres; None if it is unknown.
+        odometry_std: standard deviations of the odometry; None if they are unknown.
     """
 
     sealed_belief: bytes | None
     T_previous_camera: NDArray[np.float64] | None
+    odometry_std: OdometryStd | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -234,6 +237,7 @@ class Engine:
         encoded: EncodedQuery,
         track: Track,
         T_previous_camera: NDArray[np.float64] | None,
+        odometry_std: OdometryStd | None = None,
     ) -> tuple[Located, Track]:
         """Decode and answer the next frame of a robot, and count the answer in the metrics.
 
@@ -242,11 +246,13 @@ class Engine:
             encoded: the frame.
             track: of the frames before.
             T_previous_camera: odometry, from this camera's frame to the previous camera's frame, metres; None if it is unknown.
+            odometry_std: standard deviations of the odometry; None if they are unknown.
 
         Raises:
             StreetfixError: as for ``localize``.
         """
-        answer, following = follow(localizer, self.encode_and_search(localizer, encoded), track, T_previous_camera)
+        frame = self.encode_and_search(localizer, encoded)
+        answer, following = follow(localizer, frame, track, T_previous_camera, odometry_std)
         if following.epoch != track.epoch:
             self.metrics.disrupted(localizer.bundle)
         return self._counted(answer, localizer), following
@@ -275,7 +281,7 @@ class Engine:
                     field="track.belief",
                 )
             track = unpacked(content, map_version=version)
-        located, following = self.follow(localizer, encoded, track, carried.T_previous_camera)
+        located, following = self.follow(localizer, encoded, track, carried.T_previous_camera, carried.odometry_std)
         if located.answer.belief is None:
             return located
         content = packed(following, map_version=version)

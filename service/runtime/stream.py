@@ -5,6 +5,7 @@ from jaxtyping import Float64
 from numpy.typing import NDArray
 
 from service.errors import RequestError
+from service.localization.belief import OdometryStd
 from service.localization.localizer import Localizer
 from service.localization.tracker import Track
 from service.runtime.engine import EncodedQuery, Engine, Located
@@ -24,13 +25,17 @@ class Stream:
         self._track = Track()
 
     def localize(
-        self, encoded: EncodedQuery, T_previous_camera: Float64[NDArray[np.float64], "4 4"] | None
+        self,
+        encoded: EncodedQuery,
+        T_previous_camera: Float64[NDArray[np.float64], "4 4"] | None,
+        odometry_std: OdometryStd | None = None,
     ) -> tuple[Located, int]:
         """Localize the next frame with what the frames before say.
 
         Args:
             encoded: the frame.
             T_previous_camera: odometry, from this camera's frame to the previous camera's frame, metres. None begins again.
+            odometry_std: standard deviations of the odometry; None if they are unknown.
 
         Returns:
             The answer, and the number of frames that are registered together in it.
@@ -47,7 +52,7 @@ class Stream:
             localizer is not last
         ):  # the first frame, or another map version serves now: the poses before refer to the old one
             before = before.broken()
-        located, self._track = self._engine.follow(localizer, encoded, before, T_previous_camera)
+        located, self._track = self._engine.follow(localizer, encoded, before, T_previous_camera, odometry_std)
         return located, located.answer.frames
 
     def forget(self) -> None:

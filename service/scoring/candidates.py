@@ -14,6 +14,7 @@ from service.scoring.confirmation import Confirmation
 
 #: Two candidates are rivals beyond this distance or this angle. Adjacent positions on one street are not rivals.
 RIVAL_M, RIVAL_RAD = 3.0, float(np.deg2rad(30.0))
+_LEAST_MAPPED = 0.05
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -36,6 +37,16 @@ class Candidate:
     scores: Mapping[str, float]
     support: float
     covariance: Float64[NDArray[np.float64], "6 6"] | None = None
+
+    @property
+    def mapped_share(self) -> float:
+        """Share of the points where the map shows a surface from this pose, at least ``_LEAST_MAPPED``."""
+        return max(1.0 - self.scores["unmapped"], _LEAST_MAPPED)
+
+    @property
+    def mapped_inliers(self) -> float:
+        """Share of the points that lie on the map, relative to the share where the map shows a surface."""
+        return self.registered.inliers / self.mapped_share
 
 
 @dataclass(frozen=True, slots=True, eq=False)

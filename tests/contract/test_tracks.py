@@ -6,11 +6,12 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
+import grpc
 import httpx
 import numpy as np
 import pytest
 
-from service.client import Client, GrpcClient, PinholeCamera, RefusedError, RequestError, Track
+from service.client import Client, GrpcClient, OdometryStd, PinholeCamera, RefusedError, RequestError, Track
 from service.confidence.features import FEATURES
 from service.contract.schema import MOST_TOKEN
 from service.grpc.generated.streetfix.v1 import localization_pb2 as pb
@@ -119,6 +120,81 @@ def test_both_faces_continue_each_others_tracks(faces: Any, parts_of: Parts) -> 
     x = second["modes"][0]["pose"]["position"]["x"]
     assert x == pytest.approx(again.modes[0].pose.position.x)
     assert x == pytest.approx(20, abs=0.3)
+
+
+FAR = STEP | {"position": {"x": 0.0, "y": 0.0, "z": 2.0}}
+ROUGH = {"position_m": 2.0, "angle_deg": 3.0}
+
+
+def test_poor_odometry_leaves_the_mode_where_the_image_says(faces: Any, parts_of: Parts) -> None:
+    """Odometry says 2 m and the image none. Accurate odometry makes this another mode. With a deviation of 2 m it is the same one."""
+    client, stub, _ = faces
+    parts = parts_of()
+    first = posted(client, parts_of(track={})).json()["belief"]
+    known = {"belief": first["token"], "T_previous_camera": FAR}
+    sure = posted(client, parts_of(track=known)).json()["belief"]
+    rough = posted(client, parts_of(track=known | {"odometry_std": ROUGH})).json()["belief"]
+    assert first["modes"][0]["number"] not in [mode["number"] for mode in sure["modes"] if mode["unseen"] == 0]
+    assert first["modes"][0]["number"] in [mode["number"] for mode in rough["modes"] if mode["unseen"] == 0]
+    again = stub.Localize(
+        message_of(parts, belief=first["token"], previous_from_camera=FAR, odometry_std=pb.OdometryStd(**ROUGH))
+    ).belief
+    assert [mode.weight for mode in again.modes] == pytest.approx([mode["weight"] for mode in rough["modes"]])
+    frame = pb.LocalizeRequest(rgb=parts["rgb"], depth=parts["depth"], camera=CAMERA, depth_format=DEPTH)
+    steps = [
+        pb.LocalizeStreamRequest(frame=frame),
+        pb.LocalizeStreamRequest(frame=frame, previous_from_camera=FAR, odometry_std=pb.OdometryStd(**ROUGH)),
+    ]
+    *_, last = (each.outcome.answer.belief for each in stub.LocalizeStream(iter(steps)))
+    assert [mode.number for mode in last.modes if mode.unseen == 0] == [
+        mode["number"] for mode in rough["modes"] if mode["unseen"] == 0
+    ]
+
+
+@pytest.mark.parametrize(
+    ("std", "field"),
+    [
+        ({"position_m": 0.0, "angle_deg": 1.0}, "track.odometry_std.position_m"),
+        ({"position_m": 101.0, "angle_deg": 1.0}, "track.odometry_std.position_m"),
+        ({"position_m": 0.1, "angle_deg": 181.0}, "track.odometry_std.angle_deg"),
+        ({"position_m": 0.1}, "track.odometry_std.angle_deg"),
+    ],
+)
+def test_bad_deviations_of_odometry_are_refused(faces: Any, parts_of: Parts, std: dict[str, float], field: str) -> None:
+    client, stub, _ = faces
+    refused = posted(client, parts_of(track={"T_previous_camera": STEP, "odometry_std": std}))
+    assert (refused.status_code, refused.json()["field"]) == (422, field)
+    message = message_of(parts_of(), previous_from_camera=STEP, odometry_std=pb.OdometryStd(**std))
+    with pytest.raises(grpc.RpcError, match=field.replace(".", r"\.")):
+        stub.Localize(message)
+
+
+def test_deviations_without_odometry_are_refused(faces: Any, parts_of: Parts) -> None:
+    client, stub, _ = faces
+    refused = posted(client, parts_of(track={"odometry_std": ROUGH}))
+    assert (refused.status_code, refused.json()["field"]) == (422, "track.odometry_std")
+    assert "send the odometry" in refused.json()["detail"]
+    parts = parts_of()
+    frame = pb.LocalizeRequest(rgb=parts["rgb"], depth=parts["depth"], camera=CAMERA, depth_format=DEPTH)
+    (problem,) = stub.LocalizeStream(
+        iter([pb.LocalizeStreamRequest(frame=frame, odometry_std=pb.OdometryStd(**ROUGH))])
+    )
+    assert problem.outcome.problem.field == "frame 0.odometry_std"
+
+
+def test_the_clients_send_the_deviations_of_odometry(faces: Any, pictures: Any) -> None:
+    client, _, address = faces
+    rgb, depth_m, camera = pictures
+    std, T_far = OdometryStd(**ROUGH), T_STEP.copy()
+    T_far[2, 3] = 2.0
+    with Client(str(client.base_url)) as rest, GrpcClient(address) as remote:
+        for asking in (rest, remote):
+            first = asking.localize(rgb, depth_m, camera, track=Track())
+            track = Track(before=first, T_previous_camera=T_far, odometry_std=std)
+            second = asking.localize(rgb, depth_m, camera, track=track)
+            assert first.belief is not None
+            assert second.belief is not None
+            assert first.belief.modes[0].number in [mode.number for mode in second.belief.modes if mode.unseen == 0]
 
 
 def test_a_stream_keeps_the_track_itself(faces: Any, parts_of: Parts) -> None:

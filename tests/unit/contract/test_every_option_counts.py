@@ -80,7 +80,8 @@ def named(document: Json) -> set[tuple[str, ...]]:
 #: The height of the camera is said, or follows from the vehicle.
 HIGH = FRAME | {"camera": FRAME["camera"] | {"height_m": 0.3, "height_std_m": 0.02}}
 ON_GROUND = {"vehicle_base_on_ground": True}
-TRACK = {"track": {"belief": "AAAA", "T_previous_camera": T}}
+ODOMETRY_STD = {"position_m": 0.2, "angle_deg": 1.5}
+TRACK = {"track": {"belief": "AAAA", "T_previous_camera": T, "odometry_std": ODOMETRY_STD}}
 ALONE = [HIGH | ABOUT | TRACK | {"prior": POSITION}, FRAME | ABOUT | ON_GROUND | {"prior": WGS84}]
 SEQUENCES = [
     ABOUT | {"frames": [frame, frame | {"T_reference_camera": T}]} | more

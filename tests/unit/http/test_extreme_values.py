@@ -154,7 +154,7 @@ def full_request(parts_of: Parts, prior: str = "position") -> Json:
         "camera": document["camera"] | {"height_m": 1.5, "height_std_m": 0.05},
         "prior": {prior: where[prior], "heading_deg": 90, "heading_std_deg": 20},
         "options": {"neighbours": 5, "refine": True, "false_accept_rate": 0.02},
-        "track": {"T_previous_camera": AHEAD},
+        "track": {"T_previous_camera": AHEAD, "odometry_std": {"position_m": 0.1, "angle_deg": 1.0}},
     }
 
 

@@ -19,6 +19,7 @@ from service.localization.belief import (
     Belief,
     FrameCandidate,
     Mode,
+    OdometryStd,
     Sighting,
     agrees,
     sighting_of,
@@ -134,6 +135,18 @@ def test_a_turn_counts_in_the_covariance_of_the_angle():
     )
     _, _, share, least_rad = ODOMETRY_STD
     assert mode.covariance[5, 5] == pytest.approx(0.01**2 + (least_rad + share * 0.5) ** 2)
+
+
+def test_told_standard_deviations_of_the_odometry_replace_the_usual_ones():
+    """0.3 m and 0.05 rad in all directions, also for a robot that stands still. The 2 m ahead carry the angle of the mode along."""
+    seen = Belief().seen(Sighting((candidate(3.0, 0.8),), 0.1, 0.1))
+    told = OdometryStd(position_m=0.3, angle_rad=0.05)
+    moved_on, stays = seen.moved(AHEAD, std=told).modes[0], seen.moved(np.eye(4), std=told).modes[0]
+    assert moved_on.covariance[0, 0] == pytest.approx(0.01**2 + 0.3**2)
+    assert moved_on.covariance[1, 1] == pytest.approx(0.01**2 + 0.02**2 + 0.3**2)
+    assert moved_on.covariance[5, 5] == pytest.approx(0.01**2 + 0.05**2)
+    np.testing.assert_allclose(np.diag(stays.covariance)[[0, 1, 2]], 0.01**2 + 0.3**2)
+    assert np.diag(seen.moved(np.eye(4)).modes[0].covariance)[0] == pytest.approx(0.01**2)
 
 
 def test_somebody_may_have_carried_the_robot_away():

@@ -7,11 +7,18 @@ from service.geometry.camera import PinholeCamera
 from service.geometry.rigid import R_BODY_OPTICAL, heading_of_camera, inverse, rotation_y, rotation_z, transform_from
 from service.localization import refine as refining
 from service.localization.refine import RefineSettings, refine, settings_for_rig
-from service.registration.covariance import OF_POINTS, OF_RAYS, covariance_of, score_outer_product
+from service.registration.covariance import (
+    OF_POINTS,
+    OF_RAYS,
+    covariance_of,
+    relative_pose_covariance,
+    score_outer_product,
+)
 from service.registration.local_search import LocalPose
 from service.registration.points import PointSettings, inverse_depth_noise
 from service.registration.rays import RaySettings, adjust
 from service.registration.register import RegistrationSettings
+from service.registration.restarts import difference, spread_of_restarts
 from service.registration.visibility import SurfelRaycaster
 from service.retrieval.prior import Prior
 from service.retrieval.starts import StartSettings
@@ -399,7 +406,7 @@ def asked(monkeypatch):
 
         monkeypatch.setattr(refining, name, call)
 
-    for name in ("adjust", "score_outer_product", "covariance_of"):
+    for name in ("adjust", "spread_of_restarts", "score_outer_product", "covariance_of"):
         noted(name)
     return calls
 
@@ -413,10 +420,9 @@ def test_the_best_supported_candidate_is_adjusted_and_its_covariance_is_that_of_
     found = refined(bundle, cloud, *frames, inliers=1.0, similarity=1.0, likelihood=0.0)
     best = found.best.registered
     assert best.inliers < max(each.registered.inliers for each in found.candidates)
-    (adjusting, (raycaster, pictures, before, settings)), (covering, (information, scatter, noise, heading, model)) = (
-        asked
-    )
-    assert (adjusting, covering) == ("adjust", "covariance_of")
+    assert [name for name, _ in asked] == ["adjust", "spread_of_restarts", "covariance_of"]
+    (raycaster, pictures, before, settings), restarting, covering = (given for _, given in asked)
+    information, scatter, noise, heading, model, stability = covering
     assert raycaster.cloud is cloud
     assert settings == RefineSettings().rays
     assert [picture.noise for picture in pictures] == [3e-4, 1e-4, 2e-4]
@@ -431,7 +437,14 @@ def test_the_best_supported_candidate_is_adjusted_and_its_covariance_is_that_of_
     assert noise == 2e-4
     assert model is OF_RAYS
     assert heading == heading_of_camera(found.best.T_map_camera)
-    np.testing.assert_array_equal(found.covariance, covariance_of(information, scatter, noise, heading, OF_RAYS))
+    assert restarting == (raycaster, pictures, best, heading, settings, RefineSettings().restarts)
+    np.testing.assert_array_equal(stability.restarts, spread_of_restarts(*restarting))
+    np.testing.assert_array_equal(stability.shift, difference(best.T_map_level, before.T_map_level))
+    assert stability.mapped_inliers == before.inliers / (1.0 - found.best.scores["unmapped"])
+    assert stability.along_residual == found.confirmation.along_residual
+    expected = covariance_of(information, scatter, noise, heading, OF_RAYS, stability)
+    np.testing.assert_array_equal(found.registration_covariance, expected)
+    np.testing.assert_array_equal(found.covariance, expected + relative_pose_covariance(3))
 
 
 def test_with_too_few_intersections_pose_and_covariance_are_those_of_the_points(

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from service.geometry.rigid import rotation_z
 from service.registration import covariance
-from service.registration.covariance import CovarianceModel
+from service.registration.covariance import CovarianceModel, Stability
 from service.registration.surfel_map import SurfelMap
 
 PRIOR_SIGMA = np.array([30.0, 30.0, 0.3, *np.deg2rad([2.0, 2.0, 10.0])])
@@ -230,3 +230,69 @@ def test_the_rectification_of_a_stereo_pair_tilts_the_pose(height_m, baseline_m,
     found = covariance.rectification_covariance(height_m, baseline_m)
     tilt = np.deg2rad(tilt_deg)
     np.testing.assert_allclose(np.sqrt(np.diag(found)), [0, 0, 0, tilt, tilt, 0])
+
+
+def test_the_relative_poses_of_several_frames_turn_the_answer():
+    """0.17 degrees are 0.002967 rad about each axis, for any number of frames but one."""
+    np.testing.assert_allclose(
+        covariance.relative_pose_covariance(5), np.diag([0, 0, 0, *[0.002967**2] * 3]), rtol=1e-3
+    )
+    np.testing.assert_array_equal(covariance.relative_pose_covariance(2), covariance.relative_pose_covariance(4))
+    np.testing.assert_array_equal(covariance.relative_pose_covariance(1), np.zeros((6, 6)))
+
+
+STABLE = Stability(restarts=np.zeros((6, 6)), shift=np.zeros(6), mapped_inliers=1.0, along_residual=0.0)
+
+
+def of_rays(stability, information=None, scatter=None, **factors):
+    """Return a covariance without its floor; the information is 1e4 and the scatter as large, unless given."""
+    information = 1e4 * np.eye(8) if information is None else information
+    model = replace(MODEL, **factors)
+    scatter = information if scatter is None else scatter
+    return covariance.covariance_of(information, scatter, NOISE, 0.0, model, stability) - np.diag(FLOOR**2)
+
+
+def test_restarts_and_shift_are_added_as_outer_products():
+    """The spread counts with the square of its factor 2, the shift with that of 3."""
+    spread, shift = np.diag([0.04, 0.01, 0, 0, 0, 1e-4]), np.array([0.1, 0, 0.2, 0, 0, 0.01])
+    plain = of_rays(STABLE, restarts=2.0, shift=3.0)
+    with_both = of_rays(replace(STABLE, restarts=spread, shift=shift), restarts=2.0, shift=3.0)
+    np.testing.assert_allclose(with_both - plain, 4 * spread + 9 * np.outer(shift, shift), atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("changes", "scatter", "exponent"),
+    [
+        ({"mapped_inliers": 0.7}, 1.0, 0.5 * 0.2),
+        ({"mapped_inliers": 0.9}, 1.0, 0.0),
+        ({"along_residual": 2.0}, 1.0, -0.25 * 2.0 - 0.5 * 0.1),
+        ({"mapped_inliers": 0.9}, 16.0, 0.3 * np.log(16)),
+        ({"mapped_inliers": -9.0}, 1.0, 1.5),
+        ({"along_residual": 99.0}, 1.0, -1.5),
+    ],
+)
+def test_a_misfit_scales_everything_above_the_floor(changes, scatter, exponent):
+    """Factors 0.3 (inflation), 0.5 (points that are no inliers) and -0.25 (along residual); usually a tenth are no inliers."""
+    spread = np.diag([0.04, 0.01, 0, 0, 0, 1e-4])
+    stability, information = replace(STABLE, restarts=spread, **changes), 1e4 * np.eye(8)
+    known = {"information": information, "scatter": scatter * information, "restarts": 1.0}
+    found = of_rays(stability, misfit=(0.3, 0.5, -0.25), usual=(0.0, 0.1, 0.0), **known)
+    np.testing.assert_allclose(found, np.exp(2 * exponent) * of_rays(stability, **known), rtol=1e-6)
+
+
+def test_without_the_independent_part_only_the_scatter_counts():
+    information, scatter = 1e4 * np.eye(8), np.diag([4e4, 0, 0, 0, 0, 0, 0, 0])
+    found = of_rays(STABLE, information, scatter, independent=0.0)
+    np.testing.assert_allclose(found, np.diag([9 * 4e-4, 0, 0, 0, 0, 0]), rtol=1e-3, atol=1e-12)
+
+
+@given(
+    informations, informations, st.lists(st.floats(-50, 50), min_size=6, max_size=6), st.floats(-9, 1), st.floats(0, 99)
+)
+def test_a_covariance_of_rays_is_finite_and_positive(information, scatter, shift, inliers, along):
+    stability = Stability(
+        restarts=np.outer(shift, shift), shift=np.array(shift), mapped_inliers=inliers, along_residual=along
+    )
+    found = covariance.covariance_of(information, scatter, NOISE, 1.0, covariance.OF_RAYS, stability)
+    assert np.isfinite(found).all()
+    assert np.linalg.eigvalsh(found).min() > 0

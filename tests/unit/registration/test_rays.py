@@ -217,11 +217,13 @@ def test_the_normal_equations_are_those_with_one_more_unknown_for_every_patch(
     picture = replace(picture_of(street, pose, noise=2e-3, seed=seed), movable=movable)
     pictures = [picture] * (2 if again else 1)
     state = rays._State(R, t, float(np.log(scale)), float(offset))
-    hits = [SurfelRaycaster(city, s).intersect(state.camera_of(picture), CAMERA)] * len(pictures)
-    got = rays._normal_equations(city, pictures, hits, state, s, with_scatter=True)
-    J, r, w, patches = plain(city, picture, hits[0], R, t, scale=scale, offset=offset, s=s)
+    hits = rays._Hits.of(SurfelRaycaster(city, s), state, picture)
+    got = rays._normal_equations(pictures, [hits] * len(pictures), state, s, with_scatter=True)
+    J, r, w, patches = plain(city, picture, hits.indices, R, t, scale=scale, offset=offset, s=s)
     H, b, error = J.T @ (J * w[:, None]), J.T @ (w * r), 0.5 * (w @ r**2)
-    shift = np.where(movable, moved * picture.inverse.astype(float) ** 2, 0)[(hits[0] >= 0) & (picture.inverse > 0)]
+    shift = np.where(movable, moved * picture.inverse.astype(float) ** 2, 0)[
+        (hits.indices >= 0) & (picture.inverse > 0)
+    ]
     for own in np.unique(patches[w > 0]):
         of = (patches == own) & (w > 0)
         common = (shared * picture.noise) ** 2 + (shift[of] ** 2).mean()

@@ -152,21 +152,33 @@ def test_a_nearby_pose_hits_the_same_surfels_as_its_own_collection(seed, focal_p
     raycaster = SurfelRaycaster(cloud, SETTINGS)
     raycaster.intersect(T, camera)
     np.testing.assert_array_equal(raycaster.intersect(near, camera), intersect(cloud, near, camera))
+    thinned = thinned_by(2, camera)
+    np.testing.assert_array_equal(raycaster.intersect(near, thinned), intersect(cloud, near, thinned))
     assert len(raycaster._collections) == 1
 
 
+def thinned_by(each, camera):
+    """Return the camera of every n-th row and column of another camera's image."""
+    fx, fy, cx, cy = (value / each for value in (camera.fx, camera.fy, camera.cx, camera.cy))
+    return PinholeCamera(camera.width // each, camera.height // each, fx, fy, cx, cy)
+
+
 @pytest.mark.parametrize(
-    ("away_m", "turn_rad", "other", "gathered"),
+    ("away_m", "turn_rad", "camera", "gathered"),
     [
-        (0.99 * NEAR_M, 0.0, False, 1),
-        (1.01 * NEAR_M, 0.0, False, 2),
-        (0.0, 0.99 * NEAR_RAD, False, 1),
-        (0.0, 1.01 * NEAR_RAD, False, 2),
-        (0.0, 0.0, True, 2),
+        (0.99 * NEAR_M, 0.0, CAMERA, 1),
+        (1.01 * NEAR_M, 0.0, CAMERA, 2),
+        (0.0, 0.99 * NEAR_RAD, CAMERA, 1),
+        (0.0, 1.01 * NEAR_RAD, CAMERA, 2),
+        (0.0, 0.0, thinned_by(2, CAMERA), 1),
+        (0.0, 0.0, replace(CAMERA, width=65), 2),
+        (0.0, 0.0, replace(CAMERA, height=49), 2),
+        (0.0, 0.0, replace(CAMERA, cx=32.1), 2),
+        (0.0, 0.0, replace(CAMERA, cy=24.1), 2),
+        (0.0, 0.0, replace(CAMERA, fx=33.0, cx=31.5), 1),
     ],
 )
-def test_a_distant_pose_or_another_camera_collects_surfels_again(away_m, turn_rad, other, gathered):
-    camera = PinholeCamera(32, 24, 16.0, 16.0, 15.5, 11.5) if other else CAMERA
+def test_a_distant_pose_or_a_wider_view_collects_surfels_again(away_m, turn_rad, camera, gathered):
     raycaster = SurfelRaycaster(cloud_of(wall(10)), SETTINGS)
     raycaster.intersect(looking_ahead(), CAMERA)
     turned = Rotation.from_rotvec([0, 0, turn_rad]).as_matrix() @ looking_ahead()[:3, :3]

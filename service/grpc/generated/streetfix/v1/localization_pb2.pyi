@@ -110,12 +110,22 @@ class LocalizeRequest(_message.Message):
     def __init__(self, map: _Optional[str] = ..., rgb: _Optional[bytes] = ..., depth: _Optional[bytes] = ..., camera: _Optional[_Union[Camera, _Mapping]] = ..., depth_format: _Optional[_Union[DepthFormat, _Mapping]] = ..., gravity: _Optional[_Union[Vector3, _Mapping]] = ..., vehicle_from_camera: _Optional[_Union[RigidTransform, _Mapping]] = ..., options: _Optional[_Union[Options, _Mapping]] = ..., prior: _Optional[_Union[Prior, _Mapping]] = ..., vehicle_base_on_ground: _Optional[bool] = ..., track: _Optional[_Union[Track, _Mapping]] = ...) -> None: ...
 
 class Track(_message.Message):
-    __slots__ = ("belief", "previous_from_camera")
+    __slots__ = ("belief", "previous_from_camera", "odometry_std")
     BELIEF_FIELD_NUMBER: _ClassVar[int]
     PREVIOUS_FROM_CAMERA_FIELD_NUMBER: _ClassVar[int]
+    ODOMETRY_STD_FIELD_NUMBER: _ClassVar[int]
     belief: str
     previous_from_camera: RigidTransform
-    def __init__(self, belief: _Optional[str] = ..., previous_from_camera: _Optional[_Union[RigidTransform, _Mapping]] = ...) -> None: ...
+    odometry_std: OdometryStd
+    def __init__(self, belief: _Optional[str] = ..., previous_from_camera: _Optional[_Union[RigidTransform, _Mapping]] = ..., odometry_std: _Optional[_Union[OdometryStd, _Mapping]] = ...) -> None: ...
+
+class OdometryStd(_message.Message):
+    __slots__ = ("position_m", "angle_deg")
+    POSITION_M_FIELD_NUMBER: _ClassVar[int]
+    ANGLE_DEG_FIELD_NUMBER: _ClassVar[int]
+    position_m: float
+    angle_deg: float
+    def __init__(self, position_m: _Optional[float] = ..., angle_deg: _Optional[float] = ...) -> None: ...
 
 class LocalizeBatchRequest(_message.Message):
     __slots__ = ("requests",)
@@ -188,12 +198,14 @@ class LocalizeSequenceResponse(_message.Message):
     def __init__(self, answer: _Optional[_Union[LocalizeResponse, _Mapping]] = ...) -> None: ...
 
 class LocalizeStreamRequest(_message.Message):
-    __slots__ = ("frame", "previous_from_camera")
+    __slots__ = ("frame", "previous_from_camera", "odometry_std")
     FRAME_FIELD_NUMBER: _ClassVar[int]
     PREVIOUS_FROM_CAMERA_FIELD_NUMBER: _ClassVar[int]
+    ODOMETRY_STD_FIELD_NUMBER: _ClassVar[int]
     frame: LocalizeRequest
     previous_from_camera: RigidTransform
-    def __init__(self, frame: _Optional[_Union[LocalizeRequest, _Mapping]] = ..., previous_from_camera: _Optional[_Union[RigidTransform, _Mapping]] = ...) -> None: ...
+    odometry_std: OdometryStd
+    def __init__(self, frame: _Optional[_Union[LocalizeRequest, _Mapping]] = ..., previous_from_camera: _Optional[_Union[RigidTransform, _Mapping]] = ..., odometry_std: _Optional[_Union[OdometryStd, _Mapping]] = ...) -> None: ...
 
 class LocalizeStreamResponse(_message.Message):
     __slots__ = ("outcome", "frames")
