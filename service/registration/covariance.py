@@ -70,13 +70,13 @@ OF_POINTS = CovarianceModel(
 )
 #: Model for poses that ``adjust`` refined along the rays. Fitted on the rig families of the calibration (decision 0179).
 OF_RAYS = CovarianceModel(
-    shared=3.8,
-    axes=(1.05, 0.77, 0.72, 0.48, 0.88, 0.7),
-    axes_power=(0.0, 0.0, 0.0, 0.0, -0.23, 0.14),
-    floor=(0.01, 0.01, 0.01, 0.02, 0.03, 0.05),
-    restarts=0.44,
-    shift=0.36,
-    misfit=(0.2, 0.37, -0.24),
+    shared=3.6,
+    axes=(1.0, 0.82, 0.75, 0.48, 0.65, 0.87),
+    axes_power=(0.0,) * 6,
+    floor=(0.017, 0.017, 0.018, 0.032, 0.032, 0.049),
+    restarts=0.37,
+    shift=0.43,
+    misfit=(0.24, 0.37, -0.32),
     usual=(-0.48, 0.23, 1.56),
 )
 #: Limits of the scale by ``CovarianceModel.misfit``: exp of plus and minus this number.
