@@ -151,7 +151,7 @@ class _Collection:
 
 def _has_rays_within(inner: PinholeCamera, outer: PinholeCamera) -> bool:
     """Return whether the rays of all pixels of a camera lie in the image of another camera at the same pose."""
-    return (
+    return bool(
         (0.5 + outer.cx) / outer.fx >= inner.cx / inner.fx
         and (0.5 + outer.cy) / outer.fy >= inner.cy / inner.fy
         and (outer.width - 0.5 - outer.cx) / outer.fx >= (inner.width - 1 - inner.cx) / inner.fx
