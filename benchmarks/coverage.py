@@ -40,9 +40,26 @@ def coverage_rows(
     coverage_bar, gap_bar = (COVERAGE_BAR, SIGMA_GAP_BAR) if bars else (None, None)
     share = consistent(errors[near], covariances[near])
     report.row(f"{row}.covariance_95_coverage", share, "share", bar=coverage_bar, n=count)
+    report.row(f"{row}.inside_95_ellipsoid", inside_95(errors[near], covariances[near]), "share", n=count)
     gaps = sigma_gaps(heading_rad[near], errors[near], covariances[near])
     axis = max(gaps, key=lambda name: gaps[name])
     report.row(f"{row}.sigma_coverage_gap", gaps[axis], "share", bar=gap_bar, better="lower", n=count, why=axis)
+
+
+def _squared(errors: NDArray[np.float64], covariances: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the normalised squared error of each answer (n,)."""
+    squared: NDArray[np.float64] = np.einsum("ni,nij,nj->n", errors, np.linalg.inv(covariances), errors)
+    return squared
+
+
+def inside_95(errors: NDArray[np.float64], covariances: NDArray[np.float64]) -> float:
+    """Return the share of errors inside the 95 % ellipsoid of their covariance.
+
+    Args:
+        errors: errors (n, d).
+        covariances: covariances (n, d, d) of the errors.
+    """
+    return float((_squared(errors, covariances) <= chi2.ppf(0.95, errors.shape[1])).mean())
 
 
 def consistent(errors: NDArray[np.float64], covariances: NDArray[np.float64]) -> float:
@@ -52,7 +69,7 @@ def consistent(errors: NDArray[np.float64], covariances: NDArray[np.float64]) ->
         errors: errors (n, d).
         covariances: covariances (n, d, d) of the errors.
     """
-    squared = np.einsum("ni,nij,nj->n", errors, np.linalg.inv(covariances), errors)
+    squared = _squared(errors, covariances)
     low, high = (float(chi2.ppf(quantile, errors.shape[1])) for quantile in (0.025, 0.975))
     return float(((squared >= low) & (squared <= high)).mean())
 

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from benchmarks.coverage import consistent, coverage_rows, sigma_gaps
+from benchmarks.coverage import consistent, coverage_rows, inside_95, sigma_gaps
 from benchmarks.report import Report
 from service.geometry.rigid import R_BODY_OPTICAL, rotation_z, transform_from
 
@@ -95,6 +95,12 @@ def test_gaussian_errors_have_hardly_a_gap(gaps):
     assert max(found.values()) < 0.02
 
 
+@pytest.mark.parametrize("size", [1, 3, 6])
+def test_of_gaussian_errors_ninety_five_in_a_hundred_lie_in_the_ellipsoid(size):
+    assert inside_95(*drawn(size)) == pytest.approx(0.95, abs=0.006)
+    assert inside_95(*drawn(size, cautious=9.0)) == 1.0
+
+
 def test_only_right_answers_have_a_coverage():
     """Of five queries two are right, with errors of 2.5 and 0 sigma on each axis; one is wrong, one has no truth, one no answer."""
     errors, covariances = np.zeros((5, 6)), np.tile(0.01 * np.eye(6), (5, 1, 1))
@@ -105,6 +111,7 @@ def test_only_right_answers_have_a_coverage():
     rows = {row["id"]: row for row in report.rows}
     assert rows["of.covariance_95_coverage"]["value"] == 0.0
     assert rows["of.covariance_95_coverage"]["n"] == rows["of.sigma_coverage_gap"]["n"] == 2
+    assert rows["of.inside_95_ellipsoid"]["value"] == 0.5  # 6 x 2.5^2 is above the quantile of 12.6, and 0 below it
     assert rows["of.sigma_coverage_gap"]["value"] == pytest.approx(0.454)  # one of two is within two sigma, not 0.954
 
 
