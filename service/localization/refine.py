@@ -185,7 +185,7 @@ def refine(
 class _Adjusted:
     """The final pose, the scatter of its patches' gradients, its comparison with poses next to it, and its covariance.
 
-    The covariance does not contain the errors of the survey and of a stereo pair's rectification.
+    The covariance contains no systematic errors.
     """
 
     pose: Registered

@@ -94,7 +94,8 @@ def test_it_answers_like_the_map_built_at_once(merged, whole, small_dataset):
             [localizer.localize(Query(rgb=f.rgb(), depth_m=f.depth_m(), camera=f.camera.pinhole())) for f in frames]
         )
     for one, other in zip(*answers, strict=True):
-        assert np.linalg.norm(one.T_map_camera_guess[:3, 3] - other.T_map_camera_guess[:3, 3]) < 0.02
+        apart_m = np.linalg.norm(one.T_map_camera_guess[:3, 3] - other.T_map_camera_guess[:3, 3])
+        assert apart_m < 0.03  # the adjustment ends at a step below 2 cm
         assert one.street == other.street
 
 
