@@ -42,6 +42,10 @@ HEIGHTS_M, HEIGHT_RANGE_M = (0.2, 0.35, 0.6, 1.0, 1.5, 2.2, 3.2), (0.15, 4.0)
 REPEATS = 3
 #: A plane is the ground if at least this share of the measured pixels lies on it, and at most that share below it.
 LEAST_ON, MOST_BELOW = 0.1, 0.02
+#: Pitches that are tried as well if no plane of a level camera holds ``SURE_ON`` of the measured pixels, rad; positive is downwards. A fit
+#: finds planes within about 4 degrees of its prior. A tilted plane must hold ``LEAST_TILTED_ON``, because a camera is seldom tilted.
+PITCHES_RAD = np.deg2rad([-21.0, -14.0, -7.0, 7.0, 14.0, 21.0])
+SURE_ON, LEAST_TILTED_ON = 0.45, 0.35
 #: The usual height counts as fitting if its plane differs by less than this, metres. Beyond it the prior would bias the result.
 USUAL_WITHIN_M = 0.1
 #: A focal length that is off by a factor of two makes the estimated height wrong by the inverse factor. So an estimate whose ratio to the
@@ -179,7 +183,8 @@ def level_query(
     """Level the camera of a query, and find its height if it is not given.
 
     The usual height is tried first. If its plane is not the ground, or lies so far from it that the prior would bias the result,
-    other heights are tried. The plane with the most pixels counts, if it can be the ground.
+    other heights are tried. The plane with the most pixels counts, if it can be the ground. If no plane holds many pixels and nobody
+    knows gravity, the camera may be tilted, and pitches up to 25 degrees are tried too.
 
     Args:
         depth_m: z, metres, 0 where nothing was measured. It has the aspect ratio of the camera.
@@ -190,24 +195,62 @@ def level_query(
     Returns:
         Level of the camera, and the origin of its height. "assumed": the image shows no ground, so the usual height counts.
     """
+    may_be_tilted = down_camera is None
     if given is not None:
         level = level_camera(
             depth_m, camera, down_camera=down_camera, nominal_height_m=given.height_m, height_std_m=given.std_m
         )
+        if may_be_tilted and not _is_sure(level):
+            for best in _tilted_levels(depth_m, camera, (given.height_m,), given.std_m)[:1]:
+                if best.on_share <= level.on_share:
+                    break
+                down = -best.R_level_camera[2]
+                level = level_camera(
+                    depth_m, camera, down_camera=down, nominal_height_m=given.height_m, height_std_m=given.std_m
+                )
         return level, "given"
     usual = level_camera(depth_m, camera, down_camera=down_camera, nominal_height_m=USUAL_HEIGHT_M)
     if usual.is_ground and abs(usual.height_m - USUAL_HEIGHT_M) < USUAL_WITHIN_M:
         return usual, "estimated"
     found = [
-        level_camera(depth_m, camera, down_camera=down_camera, nominal_height_m=height_m) for height_m in HEIGHTS_M
+        (level_camera(depth_m, camera, down_camera=down_camera, nominal_height_m=height_m), False)
+        for height_m in HEIGHTS_M
     ]
-    for best in sorted((level for level in found if level.is_ground), key=lambda level: -level.on_share):
+    if may_be_tilted and not any(_is_sure(level) for level, _ in found):
+        found += [(level, True) for level in _tilted_levels(depth_m, camera, HEIGHTS_M, HEIGHT_PRIOR_M)]
+    grounds = [each for each in found if each[0].is_ground]
+    for best, is_tilted in sorted(grounds, key=lambda each: -each[0].on_share):
         level = best
         for _ in range(REPEATS):
-            level = level_camera(depth_m, camera, down_camera=down_camera, nominal_height_m=level.height_m)
+            down = -level.R_level_camera[2] if is_tilted else down_camera
+            level = level_camera(depth_m, camera, down_camera=down, nominal_height_m=level.height_m)
         if level.is_ground and HEIGHT_RANGE_M[0] <= level.height_m <= HEIGHT_RANGE_M[1]:
             return level, "estimated"
     return usual, "assumed"
+
+
+def _is_sure(level: CameraLevel) -> bool:
+    """Return whether so many pixels lie on the plane that other tilts need not be tried."""
+    return level.is_ground and level.on_share >= SURE_ON
+
+
+def _tilted_levels(
+    depth_m: Float32[NDArray[np.float32], "H W"], camera: PinholeCamera, heights_m: tuple[float, ...], std_m: float
+) -> list[CameraLevel]:
+    """Return the levels of a tilted camera whose plane can be the ground, the one with most pixels on it first."""
+    found = [
+        level_camera(
+            depth_m,
+            camera,
+            down_camera=np.array([0.0, np.cos(pitch), np.sin(pitch)]),
+            nominal_height_m=height_m,
+            height_std_m=std_m,
+        )
+        for pitch in PITCHES_RAD
+        for height_m in heights_m
+    ]
+    grounds = (level for level in found if level.is_ground and level.on_share >= LEAST_TILTED_ON)
+    return sorted(grounds, key=lambda level: -level.on_share)
 
 
 class _Ground(Structure):

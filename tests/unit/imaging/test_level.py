@@ -199,3 +199,39 @@ def test_a_plane_with_points_below_it_is_no_ground():
     level, origin = level_query(depth_m, CAMERA)
     assert origin == "estimated"
     assert level.height_m == pytest.approx(2.0, abs=0.05)
+
+
+@pytest.mark.parametrize("pitch_deg", [8, 12, 16, 20, 24])
+@pytest.mark.parametrize("height_m", [0.4, 1.0, 1.5, 2.5])
+@pytest.mark.parametrize("is_given", [False, True])
+def test_the_pitch_of_a_camera_that_looks_down_is_found_without_gravity(pitch_deg, height_m, is_given):
+    """With a house 9 m ahead."""
+    R = tilted(pitch_deg=pitch_deg)
+    depth_m = ground_depth(R, height_m)
+    ahead = (CAMERA.rays_of_pixels() @ R.T)[..., 0]
+    house = np.where(ahead > 0, 9.0 / np.maximum(ahead, 1e-6), 0).astype(np.float32)
+    depth_m = np.where((depth_m == 0) | (house < depth_m), house, depth_m)
+    given = GivenHeight(height_m, 0.05) if is_given else None
+    level, origin = level_query(depth_m, CAMERA, given=given)
+    up = level.R_level_camera @ R.T @ [0, 0, 1]
+    assert np.rad2deg(np.arccos(min(1.0, up[2]))) < 2
+    assert level.height_m == pytest.approx(height_m, abs=0.1)
+    assert origin == ("given" if is_given else "estimated")
+
+
+def test_gravity_rules_out_other_tilts():
+    """A slope that falls by 20 degrees: with gravity the camera is level, without it the slope counts as level ground."""
+    depth_m = ground_depth(tilted(pitch_deg=20), 1.5)
+    free, _ = level_query(depth_m, CAMERA)
+    told, _ = level_query(depth_m, CAMERA, down_camera=DOWN_AHEAD)
+    assert angle_deg(free.R_level_camera, tilted(pitch_deg=20)) < 1
+    assert angle_deg(told.R_level_camera, tilted()) < 10
+
+
+def test_a_sloping_surface_that_covers_little_of_the_image_is_no_ground():
+    """A bonnet below the camera slopes by 14 degrees. It covers less than a third of the pixels within reach."""
+    slope = ground_depth(tilted(pitch_deg=14), 0.6)
+    wall = np.full((120, 160), 6.0, np.float32)
+    depth_m = np.where(np.arange(120)[:, None] > 95, slope, wall).astype(np.float32)
+    level, _ = level_query(depth_m, CAMERA)
+    assert angle_deg(level.R_level_camera, tilted()) < 5
