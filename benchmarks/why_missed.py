@@ -194,9 +194,9 @@ WHY_MISSED: dict[str, Reason] = {
     ),
     "real.kitti_stereo.registration.median_m": Reason(
         0.0829505,
-        "The median was 0.074 m at first, and 0.081 m before rows were aligned and depth above the survey was omitted. Since then the noise of a stereo rig is at least half a pixel, and the left tenth of "
-        "the images is matched too. We did not measure which of the two costs 7 mm. These seven frames must not decide a "
-        "setting",
+        "The median was 0.074 m at first, and 0.081 m before rows were aligned and depth above the survey was omitted. Since the first, "
+        "the noise of a stereo rig is at least half a pixel, and the left tenth of the images is matched too. We did not measure which of "
+        "them costs 9 mm. These seven frames must not decide a setting",
     ),
     "kitti_drive.odometry_vs_reference_m": Reason(
         0.1108238,
@@ -245,8 +245,8 @@ WHY_MISSED: dict[str, Reason] = {
         57,
         "The count includes every file whose functions one request calls. 12 decode, level and fuse images, 6 retrieve, 7 register, 9 "
         "score, 4 decide, 5 compare frames and build the answer, 5 read the map, 2 are geometry, 7 belong to the engine. Tried: packages "
-        "by stage with small files joined (56 to 53; depth structure, confirmation, agreement and restarts are four more). The others have readers "
-        "of their own or several users. 20 files would hold several subjects each",
+        "by stage with small files joined (56 to 53; depth structure, confirmation, agreement and restarts are four more). The others "
+        "have readers of their own or several users. 20 files would hold several subjects each",
     ),
 }
 
