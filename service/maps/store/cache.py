@@ -11,6 +11,7 @@ import errno
 import fcntl
 import os
 import shutil
+import stat
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
@@ -187,7 +188,12 @@ def make_once(target: Path, fill: Callable[[Path], None]) -> None:
     """
     partial = target.parent / f".{target.name}{_PARTIAL}"
     while not target.is_dir():
-        partial.mkdir(parents=True, exist_ok=True)
+        try:
+            partial.mkdir(parents=True, exist_ok=True)
+        except FileExistsError:  # also if another process removed the folder before mkdir could see that it is one
+            if _is_no_folder(partial):
+                raise
+            continue
         with _locked(partial) as is_mine:
             if not is_mine:  # another process has finished or given up meanwhile
                 continue
@@ -236,6 +242,14 @@ def _locked(folder: Path) -> Iterator[bool]:
 def _is_at(descriptor: int, path: Path) -> bool:
     try:
         return os.path.samestat(os.fstat(descriptor), path.stat())
+    except FileNotFoundError:
+        return False
+
+
+def _is_no_folder(path: Path) -> bool:
+    """Return whether something other than a folder is at a path: one look, because others create and delete meanwhile."""
+    try:
+        return not stat.S_ISDIR(path.stat().st_mode)
     except FileNotFoundError:
         return False
 

@@ -1,5 +1,6 @@
 """Maps in object storage: an S3 server over a socket, and files."""
 
+import errno
 import hashlib
 import json
 import shutil
@@ -540,6 +541,30 @@ def test_who_waited_for_a_failed_fetch_tries_itself(town: Path, file_url: str, c
     other.join(30)
     assert errors == ["the first fails"]
     MapBundle.open(tiles.folder(tile))
+
+
+def test_a_folder_that_another_process_removes_at_once_is_made_again(
+    cache: TileCache, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    mkdir, refused = Path.mkdir, []
+
+    def removed_meanwhile(self: Path, *arguments: object, **named: object) -> None:
+        if self.name.endswith(".partial") and not refused:
+            refused.append(self)
+            raise FileExistsError(errno.EEXIST, "File exists", str(self))
+        mkdir(self, *arguments, **named)
+
+    monkeypatch.setattr(Path, "mkdir", removed_meanwhile)
+    cache.once(tmp_path / "cache" / "tile", lambda folder: (folder / "views").touch())
+    assert len(refused) == 1
+    assert (tmp_path / "cache" / "tile" / "views").exists()
+
+
+def test_a_file_in_place_of_the_folder_is_named(cache: TileCache, tmp_path: Path) -> None:
+    (tmp_path / "cache").mkdir(exist_ok=True)
+    (tmp_path / "cache" / ".tile.partial").touch()
+    with pytest.raises(BundleError, match=r"\.tile\.partial: the cache of maps cannot be used"):
+        cache.once(tmp_path / "cache" / "tile", lambda folder: (folder / "views").touch())
 
 
 class TestVersions:
