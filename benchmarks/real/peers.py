@@ -22,6 +22,8 @@ from research.baselines.cloud_registration import (
     points_of_depth,
     thinned_to_voxels,
 )
+from research.baselines.paper.cnn import PaperCnn
+from research.baselines.paper.other_map import nearest_scans
 from research.baselines.scan_context import ContextSettings, context_of, context_of_depth, similarities
 from service.errors import ExtraMissingError
 from service.geometry.rigid import Transform
@@ -50,7 +52,7 @@ def pooled_rows(report: Report, drives: list[tuple[float, float, int]]) -> None:
 
 
 def peer_rows(
-    report: Report, name: str, dataset: Dataset, localizer: Localizer, query_set: str
+    report: Report, name: str, dataset: Dataset, localizer: Localizer, query_set: str, network: PaperCnn
 ) -> tuple[float, float, int]:
     """Run every method on one drive and add its rows.
 
@@ -60,6 +62,7 @@ def peer_rows(
         dataset: dataset of the drive.
         localizer: localizer of its map.
         query_set: name of a query set with ground truth.
+        network: the paper's network, trained in the simulator.
 
     Returns:
         Forced share within 1 m of the best other method, that of our method, and the number of queries.
@@ -91,6 +94,7 @@ def peer_rows(
 
     add("raw_range_image", _by_raw_range(localizer, dataset, query_set, true_xy))
     add("scan_context", _by_scan_context(dataset, frames))
+    add("paper_network", nearest_scans(network, dataset, frames))
 
     def registered(peer: str, prepare: Callable[[], Locate]) -> None:
         try:

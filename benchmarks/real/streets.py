@@ -20,6 +20,7 @@ from benchmarks.real.confidence import (
     pooled_confidence_rows,
     with_correction,
 )
+from benchmarks.real.paper_network import paper_network
 from benchmarks.real.peers import peer_rows, pooled_rows
 from benchmarks.report import Report
 from model_training.datasets.dataset import Dataset
@@ -77,12 +78,15 @@ def street_rows(report: Report, data: Path, work: Path, drives: tuple[str, ...] 
         drives: names of the drives.
     """
     streets = [street for name in drives if (street := _street(report, data, work, name)) is not None]
+    if not streets:
+        return
     others, calibrated = [], []
+    network = paper_network(work / "paper_network")
     for street in streets:
         found = predict(street.localizer, street.dataset, QUERIES)
         answer_rows(report, f"real.{street.name}", found)
         _stage_rows(report, street)
-        others.append(peer_rows(report, street.name, street.dataset, street.localizer, QUERIES))
+        others.append(peer_rows(report, street.name, street.dataset, street.localizer, QUERIES, network))
         track_rows(report, street.name, street.dataset, street.localizer)
         calibrated.append(confidence_rows(report, street.name, street.dataset, street.localizer, QUERIES))
         if street.name == "kitti_0013":  # kitti_0005 has these rows among its variants

@@ -5,6 +5,7 @@ the camera's view. *One space* is what the paper would need: both on the levelle
 range in the place of intensity, enlarged to the network's 224 x 224. A LiDAR has no colour, so its images are grey.
 """
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Literal
 
@@ -47,10 +48,7 @@ class LidarPictures:
         """
         if self.space == "view":
             turned = np.zeros(len(rows)) if headings_rad is None else headings_rad
-            columns = (turned[:, None] + _GRID.azimuths_rad + np.pi) / (2 * np.pi) * _GRID.around
-            which = np.rint(columns).astype(np.int64) % _GRID.around
-            ranges = np.stack([self.frames.panoramas[row][:, at] for row, at in zip(rows, which, strict=True)])
-            return drawn_views(ranges, None)
+            return drawn_views(turned_views((self.frames.panoramas[row] for row in rows), turned), None)
         grey = getattr(self.frames, self.space)[rows]
         return np.repeat(grey[..., None], 3, axis=3)
 
@@ -63,6 +61,18 @@ class LidarPictures:
         """
         turn = rng.uniform(-TURN_RAD, TURN_RAD, len(rows)) + np.pi * rng.integers(0, 2, len(rows))
         return self.of(rows, turn)
+
+
+def turned_views(panoramas: Iterable[NDArray[np.floating]], headings_rad: NDArray[np.float64]) -> NDArray[np.floating]:
+    """Return the views of panoramas (B, rows, columns) along headings.
+
+    Args:
+        panoramas: B panoramas (rows, around); column 0 is at azimuth -pi.
+        headings_rad: headings (B,), radians, against azimuth 0 of the panorama.
+    """
+    columns = (headings_rad[:, None] + _GRID.azimuths_rad + np.pi) / (2 * np.pi) * _GRID.around
+    which = np.rint(columns).astype(np.int64) % _GRID.around
+    return np.stack([each[:, at] for each, at in zip(panoramas, which, strict=True)])
 
 
 def fused_pictures(pairs: Pairs, rows: Rows, space: Space, *, colour: bool = True) -> Pictures:

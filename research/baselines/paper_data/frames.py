@@ -28,7 +28,7 @@ from research.baselines.paper_data.picture25d import SIZE, picture_from_above
 from research.baselines.paper_data.table_one import in_proportion
 from service.errors import DatasetError
 from service.geometry.rigid import heading_of_body
-from service.imaging.pca import level_scan
+from service.imaging.pca import Level, level_scan
 from service.imaging.view_grid import ViewGrid, panorama_from_points
 
 LIDAR, CITY_SEED, FORMAT = "paper_32", 0, 1
@@ -84,6 +84,21 @@ class Frames:
 
     def __len__(self) -> int:
         return len(self.street)
+
+
+def levelled_panorama(
+    points: NDArray[np.float32], grid: ViewGrid
+) -> tuple[NDArray[np.float32], NDArray[np.float32], Level]:
+    """Return ranges and intensities (rows, around) of a scan on the view grid, and its level.
+
+    Args:
+        points: x, y, z in the sensor frame, metres, and intensity (N, 4).
+        grid: the view grid.
+    """
+    level = level_scan(points[:, :3])
+    levelled = np.c_[points[:, :3] @ level.R_level_sensor.T.astype(np.float32), points[:, 3]]
+    ranges, intensity = panorama_from_points(levelled, grid)
+    return ranges, intensity, level
 
 
 def stations_of(city: City, total: int) -> tuple[list[Station], NDArray[np.int64]]:
@@ -265,9 +280,7 @@ def _block(first: int) -> int:
         points = scan(job.scene, job.city.ground, LIDARS[LIDAR], job.rays, T, CONDITIONS["clear"], rng)
         arrays["aligned"][row] = picture_from_above(points[:, :3], aligned=True)
         arrays["plain"][row] = picture_from_above(points[:, :3], aligned=False)
-        level = level_scan(points[:, :3])
-        levelled = np.c_[points[:, :3] @ level.R_level_sensor.T.astype(np.float32), points[:, 3]]
-        ranges, intensity = panorama_from_points(levelled, job.grid)
+        ranges, intensity, level = levelled_panorama(points, job.grid)
         arrays["panoramas"][row] = ranges
         arrays["intensities"][row] = np.rint(255 * np.sqrt(intensity))
         T_map_level = T.copy()

@@ -16,7 +16,7 @@ from research.baselines.answers import nearest_streets
 from service.errors import DatasetError
 from service.geometry.camera import PinholeCamera
 from service.geometry.rigid import heading_of_body
-from service.imaging.level import level_camera
+from service.imaging.level import CameraLevel, level_camera
 from service.imaging.resample import resample
 from service.imaging.view_grid import ViewGrid
 from service.maps.streets import Streets
@@ -124,14 +124,29 @@ def make_pairs(dataset: Dataset, names: Sequence[str], folder: Path, *, report: 
     return Pairs.open(folder)
 
 
+def levelled_view(
+    rgb: NDArray[np.uint8], depth_m: NDArray[np.float32], camera: PinholeCamera, grid: ViewGrid
+) -> tuple[NDArray[np.float32], NDArray[np.uint8], CameraLevel]:
+    """Return ranges (rows, columns, metres) and colours (rows, columns, 3) of a pair on the view grid, and the camera's level.
+
+    Args:
+        rgb: colours (H, W, 3), sRGB.
+        depth_m: z (h, w), metres, 0 for no measurement.
+        camera: camera of both images.
+        grid: the view grid.
+    """
+    level = level_camera(depth_m, camera, down_camera=None, nominal_height_m=1.5)
+    ranges, colour, _ = resample(rgb, depth_m, camera, level.R_level_camera.T, grid)
+    return ranges, np.rint(colour).clip(0, 255).astype(np.uint8), level
+
+
 def _shrunk(frame: QueryFrame, grid: ViewGrid) -> dict[str, NDArray[np.generic]]:
     """Shrink one pair: colour is averaged; depth is the nearest pixel's, never an average."""
     T = frame.T_map_camera
     if T is None:
         raise DatasetError("a query set has no poses.txt, so it cannot be used for training", field="queries")
     rgb, depth_m, camera = frame.rgb(), frame.depth_m(), frame.camera.pinhole()
-    level = level_camera(depth_m, camera, down_camera=None, nominal_height_m=1.5)
-    ranges, colour, _ = resample(rgb, depth_m, camera, level.R_level_camera.T, grid)
+    ranges, colour, level = levelled_view(rgb, depth_m, camera, grid)
     T_map_level = np.eye(4)
     T_map_level[:3, :3] = T[:3, :3] @ level.R_level_camera.T
     heading = heading_of_body(T_map_level)
@@ -141,7 +156,7 @@ def _shrunk(frame: QueryFrame, grid: ViewGrid) -> dict[str, NDArray[np.generic]]
         .clip(0, 65535)
         .astype(np.uint16),
         "ranges": ranges.astype(np.float16),
-        "colours": np.rint(colour).clip(0, 255).astype(np.uint8),
+        "colours": colour,
         "views": np.array([T[0, 3], T[1, 3], heading, level.height_m]),
         "T_map_camera": T,
     }

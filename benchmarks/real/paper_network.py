@@ -1,0 +1,30 @@
+"""Train the paper's network in the simulator, once, for the comparison on real streets.
+
+It learns from a tenth of the paper's LiDAR frames and a fifth of its image pairs. ``make paper`` compares trainings of the full size.
+"""
+
+from pathlib import Path
+
+from benchmarks.paper.data import PaperData, Size
+from model_training.cli.progress import bars
+from research.baselines.paper.cnn import PaperCnn
+from research.baselines.paper.train import CnnTrainer
+from research.baselines.paper.variants import PLANS
+
+#: The variant that finds most streets in the paper's city (``reports/paper.md``), and the only one that learns from image pairs.
+VARIANT = "one_space_both"
+SIZE = Size(frames=4_674, pairs=1_520, test_images=24)
+#: Most processor time of the training, seconds. It ends earlier when the validation accuracy stops rising.
+BUDGET_S = 600.0
+
+
+def paper_network(work: Path) -> PaperCnn:
+    """Return the trained network. Data and training of an earlier run are used again; a stopped run continues.
+
+    Args:
+        work: folder of data and training.
+    """
+    data = PaperData(work, SIZE)
+    trainer = CnnTrainer(PLANS[VARIANT], data.frames, data.pairs, work / "training", budget_s=BUDGET_S)
+    with bars() as show:
+        return trainer.run("paper's network", show)
