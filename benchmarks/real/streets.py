@@ -164,8 +164,45 @@ def status_rows(
     report.row(f"{row}.forced_median_m", float(np.median(finite)) if len(finite) else None, "m", n=len(finite))
 
 
+def unpacked(data: Path, work: Path, name: str) -> Path | None:
+    """Unpack the recording of a drive; return its folder, or None if the recording is absent.
+
+    Args:
+        data: folder of the recordings.
+        work: folder of datasets.
+        name: name of the drive.
+    """
+    if not (data / name).exists():
+        return None
+    raw = work / f"{name}_raw"
+    shutil.rmtree(raw, ignore_errors=True)
+    subprocess.run([sys.executable, str(data / "unpack.py"), str(data / name), str(raw)], check=True)
+    (drive,) = raw.glob("*/*_sync")
+    return drive
+
+
+def taken(drive: Path, folder: Path) -> Dataset:
+    """Import a drive with default settings.
+
+    Args:
+        drive: folder of the drive.
+        folder: folder of the dataset. An earlier one is deleted.
+
+    Raises:
+        FileNotFoundError: the recording has no poses.
+    """
+    shutil.rmtree(folder, ignore_errors=True)
+    recording = open_recording("kitti-raw", drive, OpenSettings(depth="sgbm"))
+    trajectory = recording.trajectory()
+    if trajectory is None:
+        raise FileNotFoundError(f"{drive} has no poses (oxts)")
+    poses, _ = usual_poses(recording, trajectory)
+    take(recording, poses, folder, TakeSettings())
+    return Dataset(folder)
+
+
 def imported(data: Path, work: Path, name: str) -> Dataset | None:
-    """Import a drive with default settings; return None if the recording is absent.
+    """Unpack and import a drive with default settings; return None if the recording is absent.
 
     Args:
         data: folder of the recordings.
@@ -175,20 +212,8 @@ def imported(data: Path, work: Path, name: str) -> Dataset | None:
     Raises:
         FileNotFoundError: the recording has no poses.
     """
-    if not (data / name).exists():
-        return None
-    raw, folder = work / f"{name}_raw", work / f"{name}_data"
-    for each in (raw, folder):
-        shutil.rmtree(each, ignore_errors=True)
-    subprocess.run([sys.executable, str(data / "unpack.py"), str(data / name), str(raw)], check=True)
-    (drive,) = raw.glob("*/*_sync")
-    recording = open_recording("kitti-raw", drive, OpenSettings(depth="sgbm"))
-    trajectory = recording.trajectory()
-    if trajectory is None:
-        raise FileNotFoundError(f"{drive} has no poses (oxts)")
-    poses, _ = usual_poses(recording, trajectory)
-    take(recording, poses, folder, TakeSettings())
-    return Dataset(folder)
+    drive = unpacked(data, work, name)
+    return None if drive is None else taken(drive, work / f"{name}_data")
 
 
 def _street(report: Report, data: Path, work: Path, name: str) -> Street | None:

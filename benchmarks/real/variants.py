@@ -1,4 +1,4 @@
-"""Rows ``real.kitti_0005.*`` in other conditions: sparser surveys, grey images, a prior, five frames. Settings may be chosen on it."""
+"""Rows ``real.kitti_0005.*`` in other conditions: sparse surveys, grey or small images, a prior, five frames. Tuning may use it."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -7,7 +7,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.real.streets import QUERIES, answer_rows, imported, prior_rows, sequence_rows
+from benchmarks.real.smaller_images import write_smaller_images
+from benchmarks.real.streets import QUERIES, answer_rows, prior_rows, sequence_rows, taken, unpacked
 from benchmarks.report import Report
 from model_training.datasets.dataset import Dataset, Transforms
 from model_training.evaluation.predict import Predictions, predict
@@ -21,6 +22,8 @@ from service.retrieval.query import Query
 DRIVE = "kitti_0005"
 #: Intervals of the scans of sparse surveys. The drive has one scan every 2.7 m.
 SPARSE = (2, 3)
+#: Factors of smaller images. Focal length times baseline of the drive is 384 px m; a robot's rig with 640 pixels has 30 to 100 px m.
+SMALLER = (2, 3, 4, 6)
 
 
 class EveryScan(Dataset):
@@ -67,14 +70,20 @@ def variant_rows(report: Report, data: Path, work: Path) -> None:
         data: folder of the recordings.
         work: folder of datasets and maps.
     """
-    dataset = imported(data, work, DRIVE)
-    if dataset is None:
+    drive = unpacked(data, work, DRIVE)
+    if drive is None:
         report.row(f"real.{DRIVE}.grey.answered_within_1_m", None, "share", why=f"no recordings at {data.name}")
         return
+    dataset = taken(drive, work / f"{DRIVE}_data")
     whole = _localizer(dataset, work / "variant_map")
     answer_rows(report, f"real.{DRIVE}.grey", predict(whole, dataset, QUERIES, seen_by=grey), bars=False)
     prior_rows(report, DRIVE, dataset, whole)
     sequence_rows(report, DRIVE, dataset, whole, bars=False)
+    for factor in SMALLER:
+        smaller = taken(
+            write_smaller_images(drive, work / f"{DRIVE}_smaller_raw", factor), work / f"{DRIVE}_smaller_data"
+        )
+        answer_rows(report, f"real.{DRIVE}.smaller_{factor}", predict(whole, smaller, QUERIES), bars=False)
     for each in SPARSE:
         found = []
         for first in range(each):
