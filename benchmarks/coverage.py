@@ -1,5 +1,7 @@
 """How far the covariances of right answers describe their errors."""
 
+from typing import NamedTuple
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import chi2
@@ -13,6 +15,37 @@ COVERAGE_BAR = (0.90, 0.98)
 SIGMA_GAP_BAR = 0.05
 
 
+class Coverage(NamedTuple):
+    """Coverage of the covariances of some queries.
+
+    Attributes:
+        consistent: share of consistent errors.
+        gap: largest of the ``sigma_gaps``.
+    """
+
+    consistent: float
+    gap: float
+
+
+def worst_coverage_rows(report: Report, row: str, found: dict[str, Coverage]) -> None:
+    """Add the worst coverage of several groups of queries, with the name of the group.
+
+    Args:
+        report: collects the rows.
+        row: name that the rows begin with.
+        found: coverage of each group; at least one.
+    """
+    name = max(found, key=lambda each: _outside(found[each].consistent))
+    report.row(f"{row}.worst_covariance_95_coverage", found[name].consistent, "share", bar=COVERAGE_BAR, why=name)
+    name = max(found, key=lambda each: found[each].gap)
+    report.row(f"{row}.worst_sigma_coverage_gap", found[name].gap, "share", bar=SIGMA_GAP_BAR, better="lower", why=name)
+
+
+def _outside(share: float) -> float:
+    """Return how far a share is outside of the bar; negative inside."""
+    return max(COVERAGE_BAR[0] - share, share - COVERAGE_BAR[1])
+
+
 def coverage_rows(
     report: Report,
     row: str,
@@ -21,8 +54,8 @@ def coverage_rows(
     heading_rad: NDArray[np.float64],
     *,
     bars: bool = True,
-) -> None:
-    """Add the coverage of the covariances of right answers, accepted or not; no row without a right answer.
+) -> Coverage | None:
+    """Add the coverage of the covariances of right answers, accepted or not, and return it; no row without a right answer.
 
     Args:
         report: collects the rows.
@@ -36,7 +69,7 @@ def coverage_rows(
     near = np.isfinite(covariances).all(axis=(1, 2)) & (np.nan_to_num(off_m, nan=np.inf) < RIGHT_M)
     count = int(near.sum())
     if not count:
-        return
+        return None
     coverage_bar, gap_bar = (COVERAGE_BAR, SIGMA_GAP_BAR) if bars else (None, None)
     share = consistent(errors[near], covariances[near])
     report.row(f"{row}.covariance_95_coverage", share, "share", bar=coverage_bar, n=count)
@@ -44,6 +77,7 @@ def coverage_rows(
     gaps = sigma_gaps(heading_rad[near], errors[near], covariances[near])
     axis = max(gaps, key=lambda name: gaps[name])
     report.row(f"{row}.sigma_coverage_gap", gaps[axis], "share", bar=gap_bar, better="lower", n=count, why=axis)
+    return Coverage(share, gaps[axis])
 
 
 def _squared(errors: NDArray[np.float64], covariances: NDArray[np.float64]) -> NDArray[np.float64]:

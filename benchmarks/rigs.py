@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from benchmarks.coverage import coverage_rows
+from benchmarks.coverage import Coverage, coverage_rows, worst_coverage_rows
 from benchmarks.report import Report
 from model_training.calibration.cross_check import cross_check
 from model_training.calibration.families import NOT_FITTED
@@ -30,7 +30,7 @@ def rig_rows(report: Report, encoder: Path, work: Path) -> None:
     """
     with bars() as progress:
         asked = collected(work, encoder, report=progress)
-    figures = cross_check(asked, not_fitted=NOT_FITTED)
+    figures, coverage = cross_check(asked, not_fitted=NOT_FITTED), dict[str, Coverage]()
     for each in figures:
         row, inside, every = f"rigs.{each.family}", each.inside, each.inside + each.outside
         report.row(f"{row}.ece", each.ece, "share", bar=_ECE, better="lower", n=every)
@@ -44,7 +44,10 @@ def rig_rows(report: Report, encoder: Path, work: Path) -> None:
         if each.outside:
             report.row(f"{row}.outside_accepted", each.outside_accepted, "share", better="lower", n=each.outside)
         own = asked.where(asked.family == each.family)
-        coverage_rows(report, row, own.error, own.covariance, own.heading_rad)
+        found = coverage_rows(report, row, own.error, own.covariance, own.heading_rad)
+        if found is not None and each.family != _REPEATING:
+            coverage[each.family] = found
+    worst_coverage_rows(report, "rigs", coverage)
     rigs = [each for each in figures if each.family != _REPEATING]
     fitted = [each for each in rigs if each.family not in NOT_FITTED]
     worst = max(rigs, key=lambda each: each.ece)

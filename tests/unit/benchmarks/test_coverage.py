@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from benchmarks.coverage import consistent, coverage_rows, inside_95, sigma_gaps
+from benchmarks.coverage import Coverage, consistent, coverage_rows, inside_95, sigma_gaps, worst_coverage_rows
 from benchmarks.report import Report
 from service.geometry.rigid import R_BODY_OPTICAL, rotation_z, transform_from
 
@@ -119,3 +119,13 @@ def test_no_right_answer_gives_no_row():
     report = Report("x", "x")
     coverage_rows(report, "of", np.full((3, 6), np.nan), np.tile(np.eye(6), (3, 1, 1)), np.zeros(3))
     assert not report.rows
+
+
+def test_the_worst_group_is_furthest_from_the_bar(tmp_path):
+    """0.99 is 0.01 above the bar, 0.88 is 0.02 below it."""
+    report = Report("x", "x", folder=tmp_path)
+    worst_coverage_rows(report, "r", {"a": Coverage(0.99, 0.04), "b": Coverage(0.88, 0.02), "c": Coverage(0.94, 0.03)})
+    coverage, gap = report.rows
+    assert (coverage["id"], coverage["value"], coverage["why"]) == ("r.worst_covariance_95_coverage", 0.88, "b")
+    assert (gap["id"], gap["value"], gap["why"]) == ("r.worst_sigma_coverage_gap", 0.04, "a")
+    assert (coverage["holds"], gap["holds"]) == (False, True)

@@ -56,3 +56,6 @@ def test_the_worst_family_is_named(rows):
     assert rows["rigs.worst_ece"]["why"] == worst_of("car", "rings", "robot")
     assert rows["rigs.worst_fitted_ece"]["why"] == worst_of("car", "robot")
     assert rows["rigs.worst_within_1_m"]["why"] in ("car", "robot")
+    gap = rows["rigs.worst_sigma_coverage_gap"]
+    assert gap["value"] == max(rows[f"rigs.{name}.sigma_coverage_gap"]["value"] for name in ("car", "rings", "robot"))
+    assert rows[f"rigs.{gap['why']}.sigma_coverage_gap"]["value"] == gap["value"]
