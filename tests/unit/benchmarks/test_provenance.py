@@ -1,11 +1,12 @@
 import json
 import subprocess
+import sys
 from pathlib import Path
 
 import pytest
 
 from benchmarks import provenance
-from benchmarks.provenance import MEASURED, ROOT, mark_stale, measured_paths
+from benchmarks.provenance import MEASURED, NOT_RUN, ROOT, mark_stale, measured_paths
 
 REPORTS = sorted((ROOT / "reports").glob("*.json"))
 
@@ -47,6 +48,14 @@ def test_a_row_is_stale_where_code_that_it_measures_has_changed_since(repository
     assert ages([first, second, third], third, "all.map") == [True, True, None]
 
 
+def test_a_file_that_no_row_of_the_report_runs_does_not_count(repository, monkeypatch):
+    (_, _, third), commit = repository
+    monkeypatch.setitem(NOT_RUN, "mine", ("service/maps/store", "service/maps/tiles.py"))
+    head = [commit(f"service/maps/{name}", "1") for name in ("store/cache.py", "tiles.py")][-1]
+    assert ages([third], head, "map") == [None]
+    assert ages([third], commit("service/maps/tiles.pyi", "1"), "map") == [True]
+
+
 def test_code_that_was_changed_back_is_the_same(repository):
     (first, _, _), commit = repository
     assert ages([first], commit("service/maps/a.py", "1"), "map") == [None]
@@ -83,6 +92,17 @@ def test_every_report_says_what_its_rows_measure_and_that_is_there():
         assert "" in groups
         for path in {path for paths in groups.values() for path in paths}:
             assert (ROOT / path).exists(), path
+
+
+@pytest.mark.parametrize("report", NOT_RUN)
+def test_a_benchmark_does_not_load_what_it_claims_not_to_run(report):
+    program = f"import sys, benchmarks.{report}; print(*(getattr(m, '__file__', None) for m in sys.modules.values()), sep='\\n')"
+    done = subprocess.run([sys.executable, "-c", program], cwd=ROOT, capture_output=True, text=True, check=True)
+    loaded = {Path(name) for name in done.stdout.splitlines()}
+    assert ROOT / "model_training" / "mapping" / "build.py" in loaded
+    for path in NOT_RUN[report]:
+        assert (ROOT / path).exists(), path
+        assert not [each for each in loaded if each.is_relative_to(ROOT / path)], path
 
 
 def test_the_longest_beginning_says_what_a_row_measures():
