@@ -140,6 +140,7 @@ NOT_RUN: dict[str, tuple[str, ...]] = {
         "service/maps/tiled_writer.py",
         "service/maps/tiles.py",
         "service/localization/track_bytes.py",
+        "model_training/datasets/stored_survey.py",
         "model_training/datasets/survey_part.py",
         "model_training/mapping/area.py",
         "model_training/mapping/build_tile.py",

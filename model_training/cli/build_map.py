@@ -7,8 +7,9 @@ import typer
 from rich.console import Console
 
 from model_training.cli.progress import bars
-from model_training.datasets.dataset import MOST_SURVEY_STD_DEG, MOST_SURVEY_STD_M, Dataset
-from model_training.mapping.build import build_map, describe
+from model_training.datasets.dataset import MOST_SURVEY_STD_DEG, MOST_SURVEY_STD_M
+from model_training.datasets.stored_survey import StoredSurvey, dataset_at
+from model_training.mapping.build import build_map, describe, require_new
 from model_training.mapping.build_tiled import build_tiled
 from model_training.mapping.engines import Engine
 from model_training.mapping.settings import BuildSettings
@@ -16,7 +17,12 @@ from model_training.stock import CALIBRATION, ENCODER
 
 
 def command(
-    dataset: Annotated[Path, typer.Argument(help="Dataset folder with a survey.")],
+    dataset: Annotated[
+        str,
+        typer.Argument(
+            help="Dataset folder with a survey, or its URL in object storage, as s3://BUCKET/PATH (extra `store`)."
+        ),
+    ],
     out: Annotated[Path, typer.Option(help="Folder of the map bundle.")],
     encoder: Annotated[
         Path, typer.Option(help="ONNX file of `streetfix export`.  [default: the stock encoder]", show_default=False)
@@ -127,29 +133,32 @@ def command(
     Examples:
       streetfix build-map data/paper --out maps/paper-city
       streetfix build-map data/town --out maps/town --tile-m 500
+      streetfix build-map s3://bucket/surveys/town --out maps/town --tile-m 500
     """
     if tile_m is None:
         for option, value in (("--engine", engine), ("--workers", workers)):
             if value is not None:
                 raise typer.BadParameter("it builds tiles; give --tile-m too", param_hint=option)
-    opened = Dataset(dataset)
-    settings = BuildSettings(
-        name=name or opened.name,
-        spacing_m=spacing,
-        between_m=between,
-        headings=headings,
-        voxel_m=voxel,
-        expected_lidar_height_m=lidar_height,
-        remove_weather=remove_weather,
-        passes_vote=passes_vote,
-        traffic_vote=traffic_vote,
-        licence=licence,
-        calibration=calibration,
-        align_survey=align_survey,
-        survey_std_m=survey_std_m,
-        survey_std_deg=survey_std_deg,
-    )
-    with bars() as report:
+    with bars() as report, dataset_at(dataset, out) as opened:
+        settings = BuildSettings(
+            name=name or opened.name,
+            spacing_m=spacing,
+            between_m=between,
+            headings=headings,
+            voxel_m=voxel,
+            expected_lidar_height_m=lidar_height,
+            remove_weather=remove_weather,
+            passes_vote=passes_vote,
+            traffic_vote=traffic_vote,
+            licence=licence,
+            calibration=calibration,
+            align_survey=align_survey,
+            survey_std_m=survey_std_m,
+            survey_std_deg=survey_std_deg,
+        )
+        require_new(out, settings.name, overwrite=overwrite)  # before scans are fetched
+        if isinstance(opened, StoredSurvey) and tile_m is None:
+            opened.fetch_all(report)
         if tile_m is None:
             manifest = build_map(opened, encoder, out, settings, overwrite=overwrite, report=report)
         else:

@@ -1,7 +1,9 @@
 """Some scans of a dataset's survey."""
 
 from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -63,3 +65,50 @@ class SurveyPart(Dataset):
             DatasetError: the folder cannot be read.
         """
         return self._files_at(scan_path(self.folder, int(number)) for number in self._numbers)
+
+    def prepare(self) -> None:
+        """Bring the scans to this machine before they are read; here they are there."""
+
+    def release(self) -> None:
+        """Delete what ``prepare`` brought."""
+
+
+class PartSource(Protocol):
+    """Where a process finds a part of a survey. It can be pickled."""
+
+    def part(self, numbers: NDArray[np.int64], poses: Transforms, *, scratch: Path) -> SurveyPart:
+        """Open the part.
+
+        Args:
+            numbers: indices of the scans in the survey, ascending (n,).
+            poses: their T_map_lidar (n, 4, 4), metres.
+            scratch: folder that the part may use until ``SurveyPart.release``.
+
+        Raises:
+            DatasetError: the dataset cannot be opened.
+        """
+        ...
+
+
+@dataclass(frozen=True, slots=True)
+class FolderSource:
+    """A survey in a folder.
+
+    Attributes:
+        folder: folder of the whole dataset.
+    """
+
+    folder: Path
+
+    def part(self, numbers: NDArray[np.int64], poses: Transforms, *, scratch: Path) -> SurveyPart:  # noqa: ARG002
+        """Open the part, as ``PartSource.part``.
+
+        Args:
+            numbers: indices of the scans in the survey, ascending (n,).
+            poses: their T_map_lidar (n, 4, 4), metres.
+            scratch: not used.
+
+        Raises:
+            DatasetError: the dataset cannot be opened.
+        """
+        return SurveyPart(self.folder, numbers, poses)

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
-from model_training.datasets.survey_part import SurveyPart
+from model_training.datasets.survey_part import PartSource, SurveyPart
 from model_training.mapping.build import write_from
 from model_training.mapping.calibration_file import calibration_for
 from model_training.mapping.places import Drive
@@ -52,7 +52,7 @@ class TileTask:
     """All that a process needs to build a tile. It can be pickled.
 
     Attributes:
-        dataset: folder of the dataset.
+        dataset: where the scans of the tile are.
         encoder_file: the encoder, ONNX.
         settings: settings of the map.
         numbers: indices of the tile's scans in the survey (K,).
@@ -63,7 +63,7 @@ class TileTask:
         folder: folder of the finished tile's bundle. Its name contains the key.
     """
 
-    dataset: Path
+    dataset: PartSource
     encoder_file: Path
     settings: BuildSettings
     numbers: NDArray[np.int64]
@@ -77,6 +77,11 @@ class TileTask:
     def name(self) -> str:
         """Name of the tile in messages."""
         return f"tile {self.part.square.column}, {self.part.square.row}"
+
+    @property
+    def scratch(self) -> Path:
+        """Folder for scans that come from a store, while the tile is built."""
+        return self.folder.with_name(f".{self.folder.name}.scans")
 
     @property
     def is_finished(self) -> bool:
@@ -132,12 +137,12 @@ def build_tile(task: TileTask, share: Share = lambda _: None) -> None:
         share: called with the finished share of the tile.
 
     Raises:
-        DatasetError: a scan is damaged.
+        DatasetError: a scan is damaged, or cannot be fetched.
         EncoderError: the encoder cannot be used.
         BundleError: the bundle cannot be written, or this process sees other inputs than the one that planned the tiles.
     """
     with threadpool_limits(limits=THREADS):
-        dataset = SurveyPart(task.dataset, task.numbers, task.poses)
+        dataset = task.dataset.part(task.numbers, task.poses, scratch=task.scratch)
         encoder = Encoder.open(task.encoder_file, threads=THREADS)
         if key_of_tile(dataset, encoder.sha256, task.settings, task.part, task.common) != task.key:
             raise BundleError(
@@ -152,6 +157,7 @@ def build_tile(task: TileTask, share: Share = lambda _: None) -> None:
         with work_beside(task.folder, task.key, wait_s=_WAIT_S) as work:
             if task.is_finished:  # by an earlier attempt that this one has just waited for
                 return
+            dataset.prepare()
             stages = ResumedStages(
                 work, dataset, kept, task.settings, shares_of_stages(task.settings, share), task.part
             )
@@ -174,6 +180,7 @@ def build_tile(task: TileTask, share: Share = lambda _: None) -> None:
                 apart,
                 lidar_height_m=task.common.lidar_height_m,
             )
+            dataset.release()
 
 
 def shares_of_stages(settings: BuildSettings, share: Share) -> Callable[[str, int, int], None]:

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from model_training.datasets.dataset import Dataset
-from model_training.datasets.survey_part import SurveyPart
+from model_training.datasets.stored_survey import source_of
 from model_training.mapping.build import Report, require_new
 from model_training.mapping.build_tile import THREADS, CommonValues, TileTask, key_of_tile
 from model_training.mapping.calibration_file import calibration_for
@@ -108,12 +108,13 @@ def _tasks(
     tasks = []
     for done, part in enumerate(parts):
         numbers = kept[part.order]
-        of_tile = SurveyPart(dataset.folder, numbers, poses[numbers])
+        source = source_of(dataset, numbers)
+        of_tile = source.part(numbers, poses[numbers], scratch=dataset.folder)
         key = key_of_tile(of_tile, encoder.sha256, settings, part, common)
         folder = work.folder / f"{_TILE}{part.square.column}_{part.square.row}_{key}"
         tasks.append(
             TileTask(
-                dataset.folder.resolve(),
+                source,
                 encoder_file.resolve(),
                 settings,
                 numbers,

@@ -1,7 +1,7 @@
 """Shared fixtures: a simulated drive and its map, made once and on demand, and factories."""
 
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from hypothesis import settings
 
+from benchmarks.scale.s3_server import s3_server
 from model_training.mapping.voxel_map import VoxelMap
 from service.confidence.features import FEATURES
 from service.geometry.camera import PinholeCamera
@@ -40,6 +41,14 @@ from tests.unit.street_scene import (  # noqa: F401  # fixtures for the tests of
 # The same examples on every machine, and no clock: a busy one is no defect of the code.
 settings.register_profile("steady", deadline=None, derandomize=True)
 settings.load_profile("steady")
+
+
+@pytest.fixture(scope="session")
+def s3() -> Iterator[dict[str, str]]:
+    """Run an S3 server; return the environment variables with which obstore finds it."""
+    with s3_server() as environment:
+        yield environment
+
 
 BERLIN = {"latitude_deg": 52.52, "longitude_deg": 13.405, "height_m": 70.0}
 

@@ -5,6 +5,7 @@ import os
 import re
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
 from datetime import timedelta
 from pathlib import Path
 from typing import TYPE_CHECKING, BinaryIO
@@ -14,6 +15,7 @@ from service.errors import BundleError, extra_missing
 from service.maps.manifest import FILE, FileEntry
 
 if TYPE_CHECKING:
+    from obstore import GetResult
     from obstore.store import ObjectStore
 
 #: Schemes of the URLs of maps.
@@ -38,8 +40,43 @@ _STATUS = re.compile(r"status code: (\d{3}[^:\n]*)")
 _CODE = re.compile(r"<Code>(\w{1,64})</Code>")
 
 
+@dataclass(frozen=True, slots=True)
+class Content:
+    """What is below a URL, for messages.
+
+    Attributes:
+        name: with its article.
+        remedy: how to put it there.
+        field: setting or argument that has the URL.
+    """
+
+    name: str
+    remedy: str
+    field: str
+
+
+MAP = Content("a map", "push the map (streetfix map push)", "maps")
+
+
+@dataclass(frozen=True, slots=True)
+class StoredFile:
+    """An object of a store, as a list shows it.
+
+    Attributes:
+        name: path below the URL.
+        size: bytes.
+        modified_ns: time of the last change, nanoseconds since 1970.
+        e_tag: mark that changes with the content; None if the store has none.
+    """
+
+    name: str
+    size: int
+    modified_ns: int
+    e_tag: str | None
+
+
 def is_url(text: str) -> bool:
-    """Return whether a text is the URL of a map, and not a path.
+    """Return whether a text is a URL, and not a path.
 
     Args:
         text: of a setting or of the command line.
@@ -47,11 +84,12 @@ def is_url(text: str) -> bool:
     return "://" in text
 
 
-def checked_url(text: str) -> str:
-    """Return the URL of a map without a final slash.
+def checked_url(text: str, content: Content = MAP) -> str:
+    """Return a URL of a store without a final slash.
 
     Args:
         text: the URL, such as ``s3://bucket/maps/town``.
+        content: what is there, for messages.
 
     Raises:
         BundleError: another scheme, no bucket or path, or a URL with credentials, a query or a fragment. The message repeats none of
@@ -60,18 +98,20 @@ def checked_url(text: str) -> str:
     try:
         parts = urlsplit(text)
         if "@" in parts.netloc:
-            raise _wrong_url(parts.scheme, "has credentials; give them in environment variables (docs/operate.md)")
+            raise _wrong_url(
+                content, parts.scheme, "has credentials; give them in environment variables (docs/operate.md)"
+            )
     except ValueError as error:
-        raise _wrong_url(text.partition("://")[0], "is not valid; write s3://BUCKET/PATH") from error
+        raise _wrong_url(content, text.partition("://")[0], "is not valid; write s3://BUCKET/PATH") from error
     if parts.scheme not in SCHEMES:
         known = ", ".join(f"{each}://" for each in SCHEMES)
-        raise _wrong_url(parts.scheme, f"has no scheme of a store; write one of {known}")
+        raise _wrong_url(content, parts.scheme, f"has no scheme of a store; write one of {known}")
     if parts.query or parts.fragment:
-        raise _wrong_url(parts.scheme, "has a '?' or '#'; write only bucket and path")
+        raise _wrong_url(content, parts.scheme, "has a '?' or '#'; write only bucket and path")
     if parts.scheme == "file" and (parts.netloc or not parts.path.strip("/")):
-        raise _wrong_url(parts.scheme, "names no folder; write three slashes, as in file:///srv/maps/town")
+        raise _wrong_url(content, parts.scheme, "names no folder; write three slashes, as in file:///srv/maps/town")
     if parts.scheme != "file" and not parts.netloc:
-        raise _wrong_url(parts.scheme, "names no bucket; write s3://BUCKET/PATH")
+        raise _wrong_url(content, parts.scheme, "names no bucket; write s3://BUCKET/PATH")
     return text.rstrip("/")
 
 
@@ -79,8 +119,8 @@ def _scheme_of(url: str) -> str:
     return url.partition(":")[0]
 
 
-def _wrong_url(scheme: str, what: str) -> BundleError:
-    return BundleError(f"the URL {scheme}://... of a map {what}", field="maps")
+def _wrong_url(content: Content, scheme: str, what: str) -> BundleError:
+    return BundleError(f"the URL {scheme}://... of {content.name} {what}", field=content.field)
 
 
 class Remote:
@@ -89,39 +129,41 @@ class Remote:
     Args:
         url: as ``checked_url`` returns it.
         store: opened for this URL.
+        content: what is there, for messages.
 
     Attributes:
         url: as given.
     """
 
-    def __init__(self, url: str, store: "ObjectStore") -> None:
+    def __init__(self, url: str, store: "ObjectStore", content: Content = MAP) -> None:
         self.url = url
-        self._store = store
+        self._store, self._content = store, content
 
     @classmethod
-    def open(cls, url: str, *, create: bool = False) -> "Remote":
+    def open(cls, url: str, *, create: bool = False, content: Content = MAP) -> "Remote":
         """Open a store. Only for ``file://`` does this look at the store.
 
         Credentials, region and endpoint come from the environment, as obstore documents: ``AWS_ACCESS_KEY_ID``, ``AWS_ENDPOINT_URL``,
         ``GOOGLE_APPLICATION_CREDENTIALS``, ``AZURE_STORAGE_ACCOUNT_NAME`` and others.
 
         Args:
-            url: URL of a map.
+            url: URL of what is in the store.
             create: create the folder of a ``file://`` URL.
+            content: what is there, for messages.
 
         Raises:
             BundleError: the URL or the configuration of the store is not valid, or the folder is missing.
             ExtraMissingError: obstore is not installed.
         """
-        url = checked_url(url)
+        url = checked_url(url, content)
         try:
             from obstore.exceptions import BaseError
             from obstore.store import LocalStore, from_url
         except ModuleNotFoundError as error:
-            raise extra_missing(f"{url}: a map in object storage", "store", error) from error
+            raise extra_missing(f"{url}: {content.name} in object storage", "store", error) from error
         try:
             if url.startswith("file://"):
-                return cls(url, LocalStore.from_url(url, mkdir=create))
+                return cls(url, LocalStore.from_url(url, mkdir=create), content)
             retry = {
                 "max_retries": _RETRIES,
                 "retry_timeout": _RETRY_FOR,
@@ -130,7 +172,7 @@ class Remote:
             # obstore reads this variable itself, but not beside other options of the client.
             allow_http = os.environ.get(_ALLOW_HTTP[_scheme_of(url)], "").lower() in ("1", "true")
             client = {**_CLIENT, "allow_http": allow_http}
-            return cls(url, from_url(url, client_options=client, retry_config=retry))  # type: ignore[call-overload]
+            return cls(url, from_url(url, client_options=client, retry_config=retry), content)  # type: ignore[call-overload]
         except (BaseError, ValueError, OSError) as error:
             raise _failed(url, "cannot be opened", error) from error
 
@@ -156,7 +198,7 @@ class Remote:
                 return None
             if found.meta["size"] > MOST_READ_BYTES:
                 raise BundleError(
-                    f"{self.url}/{name}: {found.meta['size']} bytes, more than {MOST_READ_BYTES}; push the map again",
+                    f"{self.url}/{name}: {found.meta['size']} bytes, more than {MOST_READ_BYTES}; {self._content.remedy}",
                     field=name,
                 )
             return bytes(found.bytes()), found.meta["e_tag"]
@@ -196,15 +238,10 @@ class Remote:
                 found = self._store.get(name)
             except FileNotFoundError as error:
                 raise self._damaged(name, "is missing in the store") from error
-            chunks = iter(found.stream(min_chunk_size=_CHUNK))
         if (size := found.meta["size"]) != entry.size:
             raise self._damaged(name, f"{size} bytes instead of {entry.size}")
         digest, read = hashlib.sha256(), 0
-        while True:
-            with self._naming_errors(name):
-                chunk = next(chunks, None)
-            if chunk is None:
-                break
+        for chunk in self._chunks(name, found):
             read += len(chunk)
             if read > entry.size:
                 break
@@ -215,6 +252,53 @@ class Remote:
             raise self._damaged(name, f"{read} bytes instead of {entry.size}")
         if digest.hexdigest() != entry.sha256:
             raise self._damaged(name, "the hash does not match the manifest")
+
+    def files(self, folder: str) -> list[StoredFile]:
+        """List the objects in a folder and below it, by name.
+
+        Args:
+            folder: path below the URL.
+
+        Raises:
+            BundleError: the store cannot be read.
+        """
+        with self._naming_errors(folder):
+            found = [each for chunk in self._store.list(folder) for each in chunk]
+        return sorted(
+            (
+                StoredFile(each["path"], each["size"], round(each["last_modified"].timestamp() * 1e9), each["e_tag"])
+                for each in found
+            ),
+            key=lambda file: file.name,
+        )
+
+    def save_listed(self, file: StoredFile, target: BinaryIO, *, on_bytes: Callable[[int], object]) -> None:
+        """Stream an object into an open file, if it is still the one of the list.
+
+        Args:
+            file: of ``files``.
+            target: open for writing.
+            on_bytes: called with the number of bytes of each piece. It may raise to end the transfer.
+
+        Raises:
+            BundleError: the object is missing, cannot be read, or has changed since it was listed.
+            OSError: the file cannot be written.
+        """
+        from obstore.exceptions import PreconditionError
+
+        changed = BundleError(
+            f"{self.url}/{file.name} has changed since the command began; run it again", field=file.name
+        )
+        with self._naming_errors(file.name):
+            try:
+                found = self._store.get(file.name, options={"if_match": file.e_tag} if file.e_tag else None)
+            except PreconditionError as error:
+                raise changed from error
+        if found.meta["size"] != file.size:
+            raise changed
+        for chunk in self._chunks(file.name, found):
+            target.write(chunk)
+            on_bytes(len(chunk))
 
     def put(self, name: str, content: bytes | Path) -> None:
         """Store an object. Readers see the whole object or the one before.
@@ -228,6 +312,17 @@ class Remote:
         """
         with self._naming_errors(name, "cannot be written"):
             self._store.put(name, content, max_concurrency=_PARTS)
+
+    def _chunks(self, name: str, found: "GetResult") -> Iterator[bytes]:
+        """Yield the content of an object piece by piece; errors name the object."""
+        with self._naming_errors(name):
+            chunks = iter(found.stream(min_chunk_size=_CHUNK))
+        while True:
+            with self._naming_errors(name):
+                chunk = next(chunks, None)
+            if chunk is None:
+                return
+            yield chunk
 
     def _damaged(self, name: str, what: str) -> BundleError:
         # Only without this manifest does ``push`` store the files again.
@@ -246,7 +341,7 @@ class Remote:
             yield
         except FileNotFoundError as error:
             problem = "is missing in the store" if what == "cannot be read" else f"{what} (404: no such bucket)"
-            remedy = "check the URL, or push the map (streetfix map push)"
+            remedy = f"check the URL, or {self._content.remedy}"
             raise BundleError(f"{self.url}/{name} {problem}; {remedy}", field=name) from error
         except (BaseError, OSError, ValueError) as error:
             raise _failed(f"{self.url}/{name}", what, error) from error

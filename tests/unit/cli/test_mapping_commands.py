@@ -1,6 +1,7 @@
 """``simulate``, ``import``, ``build-map``, ``train`` and ``export`` as a user calls them."""
 
 import json
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 
@@ -243,6 +244,26 @@ def test_build_map_makes_a_bundle_that_opens(
     assert bundle.calibration is not None
     manifest = bundle.manifest
     assert (manifest.name, manifest.headings, manifest.spacing_m, manifest.licence) == ("town", 4, 20.0, "CC0-1.0")
+
+
+def test_build_map_reads_a_survey_in_object_storage(
+    simulated: Path, encoder_file: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """All scans come before the first stage, and go at the end. A map that exists is refused before they come."""
+    url, out = f"file://{shutil.copytree(simulated, tmp_path / 'store')}", tmp_path / "map"
+    arguments = ("--encoder", encoder_file, "--spacing", "20", "--headings", "4", "--name", "town")
+    calibration = ("--calibration", tmp_path / "no.json")
+    assert run("build-map", url, "--out", out, *arguments, *calibration) == 1
+    assert "no.json cannot be read" in capsys.readouterr().err
+    assert [path.name.partition("-")[0] for path in tmp_path.glob(".map.*")] == [".map.survey"]
+    assert run("build-map", simulated, "--out", tmp_path / "local", *arguments) == 0
+    assert run("build-map", url, "--out", out, *arguments) == 0
+    one, other = (MapBundle.open(path) for path in (out, tmp_path / "local"))
+    assert one.manifest.version == other.manifest.version
+    assert not list(tmp_path.glob(".map.*"))
+    assert run("build-map", url, "--out", out, *arguments) == 1
+    assert "already exists" in capsys.readouterr().err
+    assert not list(tmp_path.glob(".map.*/survey/scans"))
 
 
 def test_build_map_with_a_calibration_that_is_missing_says_what_makes_one(

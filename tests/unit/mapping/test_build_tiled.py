@@ -18,8 +18,10 @@ import pytest
 import typer
 from scipy.spatial import cKDTree
 
+from benchmarks.scale.s3_server import BUCKET
 from model_training.cli.build_map import command
 from model_training.datasets.dataset import Dataset
+from model_training.datasets.stored_survey import dataset_at
 from model_training.datasets.survey_part import SurveyPart
 from model_training.mapping import build_tiled as driver
 from model_training.mapping import engines, site_check
@@ -33,6 +35,7 @@ from model_training.mapping.work import work_folder
 from service.errors import BundleError, DatasetError, ExtraMissingError
 from service.maps.manifest import read_manifest
 from service.maps.reader import MapBundle
+from service.maps.store.remote import Remote
 from service.retrieval.encoder import Encoder
 
 #: 11 scans along 60 m; the map frame's axes cut them into two tiles.
@@ -287,6 +290,55 @@ def test_processes_give_the_same_bytes_although_one_is_killed(small_dataset, enc
     assert "its process was killed by SIGKILL (is the memory full?); the tile goes on in another process" in said[0]
 
 
+@pytest.fixture
+def survey_url(small_dataset, s3, tmp_path, monkeypatch):
+    """Return the URL of a copy of the survey on an S3 server."""
+    for key, value in s3.items():
+        monkeypatch.setenv(key, value)
+    url = f"s3://{BUCKET}/{tmp_path.name}/survey"
+    remote = Remote.open(url)
+    for name in ("dataset.json", "streets.geojson", "survey/poses.txt"):
+        if (small_dataset.folder / name).exists():
+            remote.put(name, small_dataset.folder / name)
+    for name, *_ in small_dataset.scan_files():
+        remote.put(f"survey/scans/{name}", small_dataset.folder / "survey" / "scans" / name)
+    return url
+
+
+def test_a_survey_in_object_storage_gives_the_same_map(survey_url, encoder_file, undisturbed, serial, tmp_path):
+    """Each tile fetches its own scans and deletes them, so one tile's scans at most are there."""
+    out, there = tmp_path / "m", []
+
+    def report(stage, *_):
+        there.append(len(list(work_folder(out).glob(".tile_*.scans"))))
+
+    with dataset_at(survey_url, out) as survey:
+        build_tiled(survey, encoder_file, out, SETTINGS, tile_m=TILE_M, report=report)
+    assert files_of(out) == undisturbed
+    assert max(there) == 1
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["m"]
+
+
+def test_a_process_that_is_killed_after_it_fetched_leaves_nothing(survey_url, encoder_file, undisturbed, tmp_path):
+    killed, said, scans = [], [], []
+
+    def report(stage, _done, _total):
+        if stage.startswith("scans") and not killed and multiprocessing.active_children():
+            scans.extend(work_folder(tmp_path / "m").glob(".tile_*.scans/survey/scans/*.bin"))
+            if scans:
+                process = multiprocessing.active_children()[0]
+                killed.append(process)
+                process.kill()
+
+    with dataset_at(survey_url, tmp_path / "m") as survey:
+        build_tiled(
+            survey, encoder_file, tmp_path / "m", SETTINGS, tile_m=TILE_M, workers=1, report=report, warn=said.append
+        )
+    assert files_of(tmp_path / "m") == undisturbed
+    assert len(killed) == len(said) == 1
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["m"]
+
+
 def test_a_tile_whose_process_dies_again_and_again_stops_the_build(small_dataset, encoder_file, tmp_path):
     """No process is left, and the next build can begin."""
     said = []
@@ -425,6 +477,6 @@ def test_the_default_engine_needs_nothing():
 @pytest.mark.parametrize("option", [{"workers": 2}, {"engine": "local"}])
 def test_options_of_tiles_without_an_edge_are_refused(small_dataset, option, tmp_path):
     with pytest.raises(typer.BadParameter, match="it builds tiles; give --tile-m too") as refused:
-        command(small_dataset.folder, tmp_path / "m", **option)
+        command(str(small_dataset.folder), tmp_path / "m", **option)
     assert refused.value.param_hint == f"--{next(iter(option))}"
     assert list(tmp_path.iterdir()) == []

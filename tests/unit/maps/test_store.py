@@ -8,7 +8,7 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from datetime import UTC, datetime
 from functools import partial
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
@@ -16,7 +16,7 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks.scale.s3_server import BUCKET, CREDENTIALS, s3_server
+from benchmarks.scale.s3_server import BUCKET, CREDENTIALS
 from service.errors import BundleError, ExtraMissingError
 from service.maps.content import NOT_SERVED, BundleContent
 from service.maps.manifest import Manifest, Tile, read_manifest
@@ -49,12 +49,6 @@ def town(content_of: Content, encoder_of: Callable[..., bytes], tmp_path_factory
     path = tmp_path_factory.mktemp("tiled") / "town"
     write_tiled_map(path, content_of, encoder_of())
     return path
-
-
-@pytest.fixture(scope="module")
-def s3() -> Iterator[dict[str, str]]:
-    with s3_server() as environment:
-        yield environment
 
 
 @pytest.fixture(params=["s3", "file"])
