@@ -13,6 +13,7 @@ from datetime import UTC, datetime
 from functools import partial
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -542,7 +543,7 @@ def test_a_folder_that_another_process_removes_at_once_is_made_again(
 ) -> None:
     mkdir, refused = Path.mkdir, []
 
-    def removed_meanwhile(self: Path, *arguments: object, **named: object) -> None:
+    def removed_meanwhile(self: Path, *arguments: Any, **named: Any) -> None:
         if self.name.endswith(".partial") and not refused:
             refused.append(self)
             raise FileExistsError(errno.EEXIST, "File exists", str(self))
