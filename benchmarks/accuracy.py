@@ -26,6 +26,7 @@ from benchmarks.rigs import rig_rows
 from benchmarks.runs import Runs, share
 from benchmarks.sequences import sequence_rows
 from benchmarks.speed import speed_rows
+from benchmarks.surveys import survey_rows
 from benchmarks.tracks import track_rows
 from benchmarks.weather import weather_rows
 from model_training.evaluation.error_measures import wilson_interval
@@ -192,6 +193,7 @@ def main() -> None:
         "priors": lambda: prior_rows(report, runs),
         "heights": lambda: height_rows(report, runs),
         "ground": lambda: ground_rows(report, runs),
+        "surveys": lambda: survey_rows(report, runs),
         "rigs": lambda: rig_rows(report, arguments.encoder, arguments.calibration_work),
         "rig_calibration": lambda: rig_calibration_rows(report, runs),
         "unseen": lambda: unseen_rows(report, runs),

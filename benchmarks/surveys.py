@@ -1,0 +1,84 @@
+"""Surveys of different density: a scan every 1, 2, 5 and 10 m, and a map of a single scan."""
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from benchmarks.plans import hard_plan, unseen_plan
+from benchmarks.report import Report
+from benchmarks.runs import Runs, accepted_within, within
+from model_training.datasets.dataset import Dataset, QueryFrame, Transforms
+from model_training.evaluation.predict import Predictions, joined
+from model_training.mapping.settings import BuildSettings
+
+SPACINGS_M = (1.0, 2.0, 5.0, 10.0)
+QUERIES = "clear_precise"
+#: Number of maps of a single scan. Their scans are spread over the survey. Queries within NEAR_M of the scan are asked.
+SINGLE_SCANS, NEAR_M = 25, 5.0
+
+
+class OneScan(Dataset):
+    """A dataset whose survey is a single scan, with the queries near it.
+
+    Args:
+        survey: folder of the dataset with the survey.
+        queries: dataset with the queries.
+        number: number of the scan.
+    """
+
+    def __init__(self, survey: Path, queries: Dataset, number: int) -> None:
+        super().__init__(survey)
+        self._queries, self._number = queries, number
+
+    def survey_poses(self) -> Transforms:
+        """Return T_map_lidar of the scan (1, 4, 4), metres."""
+        return super().survey_poses()[[self._number]]
+
+    def scan(self, number: int) -> NDArray[np.float32]:
+        """Return the scan (n, 4): x, y, z in the LiDAR frame (m) and intensity.
+
+        Args:
+            number: 0.
+        """
+        return super().scan(self._number + number)
+
+    def queries(self, name: str) -> Iterator[QueryFrame]:
+        """Yield the frames of a query set that are within ``NEAR_M`` of the scan.
+
+        Args:
+            name: name of the query set.
+        """
+        (T_map_lidar,) = self.survey_poses()
+        for frame in self._queries.queries(name):
+            T = frame.T_map_camera
+            if T is not None and np.hypot(*(T[:2, 3] - T_map_lidar[:2, 3])) <= NEAR_M:
+                yield frame
+
+
+def survey_rows(report: Report, runs: Runs) -> None:
+    """Add the rows of each survey: accepted and right, right when forced, accepted and wrong.
+
+    Args:
+        report: collects the rows.
+        runs: simulates, builds and answers, or reuses what is kept on disk.
+    """
+    survey, asked = runs.dataset(unseen_plan(0)), runs.dataset(hard_plan())  # the same city: hard_plan has its seed
+    for spacing_m in SPACINGS_M:
+        bundle = runs.bundle(survey, BuildSettings(name=f"survey-{spacing_m:g}-m", spacing_m=spacing_m))
+        _rows(report, f"survey.every_{spacing_m:g}_m", runs.predictions(bundle, asked, QUERIES))
+    found = []
+    for number in np.linspace(0, len(survey.survey_poses()) - 1, SINGLE_SCANS).round().astype(int):
+        single = OneScan(survey.folder, asked, int(number))
+        if any(True for _ in single.queries(QUERIES)):
+            bundle = runs.bundle(single, BuildSettings(name=f"single-scan-{number}"))
+            found.append(runs.predictions(bundle, single, QUERIES))
+    _rows(report, "survey.single_scan", joined(found))
+
+
+def _rows(report: Report, row: str, found: Predictions) -> None:
+    right = within(found, 1.0)
+    report.share(f"{row}.within_1_m", accepted_within(found, 1.0))
+    report.share(f"{row}.forced_within_1_m", right)
+    report.share(f"{row}.wrong_and_accepted", found.localized & ~right, better="lower")
