@@ -4,7 +4,7 @@ import numpy as np
 
 from benchmarks.plans import BOTH, unseen_plan
 from benchmarks.report import Report
-from benchmarks.runs import Runs, accepted_within
+from benchmarks.runs import Runs, accepted_within, prior_with_std
 from benchmarks.sequences import between_landmarks, repeating_answers
 from model_training.evaluation.predict import Predictions, PriorOf
 from model_training.simulation.repeating import BLOCK_M
@@ -12,16 +12,6 @@ from service.geometry.rigid import Transform
 from service.retrieval.prior import Prior
 
 STD_M = 5.0
-
-
-def right(T_map_camera: Transform, rng: np.random.Generator) -> Prior:
-    """Make a prior whose error matches its standard deviation.
-
-    Args:
-        T_map_camera: ground-truth pose (4, 4).
-        rng: source of randomness.
-    """
-    return Prior(position_m=T_map_camera[:2, 3] + rng.normal(0, STD_M, 2), position_std_m=STD_M)
 
 
 def aside(T_map_camera: Transform, rng: np.random.Generator) -> Prior:
@@ -58,7 +48,7 @@ def next_block(T_map_camera: Transform, _rng: np.random.Generator) -> Prior:
     return Prior(position_m=T_map_camera[:2, 3] + [BLOCK_M, 0.0], position_std_m=STD_M)
 
 
-PRIORS: dict[str, PriorOf] = {"right": right, "aside": aside, "elsewhere": elsewhere}
+PRIORS: dict[str, PriorOf] = {"right": prior_with_std(STD_M), "aside": aside, "elsewhere": elsewhere}
 
 
 def prior_rows(report: Report, runs: Runs) -> None:
@@ -75,7 +65,7 @@ def prior_rows(report: Report, runs: Runs) -> None:
         _rows(report, f"prior.none.{preset}", runs.predictions(bundle, dataset, name))
         for kind, prior_of in PRIORS.items():
             _rows(report, f"prior.{kind}.{preset}", runs.predictions(bundle, dataset, name, prior=(kind, prior_of)))
-    for kind, prior_of in (("right", right), ("next_block", next_block)):
+    for kind, prior_of in (("right", PRIORS["right"]), ("next_block", next_block)):
         found = repeating_answers(runs, prior=(kind, prior_of))
         _rows(report, f"prior.{kind}.repeating", found.of(between_landmarks(found)))
 

@@ -23,6 +23,7 @@ from benchmarks.real.confidence import (
 from benchmarks.real.paper_network import paper_network
 from benchmarks.real.peers import peer_rows, pooled_rows
 from benchmarks.report import Report
+from benchmarks.runs import prior_with_std
 from model_training.datasets.dataset import Dataset
 from model_training.evaluation.failures import position_errors
 from model_training.evaluation.measures import recall_at
@@ -38,11 +39,9 @@ from model_training.mapping.settings import BuildSettings
 from model_training.odometry.align_poses import usual_poses
 from model_training.stock import ENCODER
 from service.errors import NoDepthError
-from service.geometry.rigid import Transform
 from service.localization.localizer import Localizer
 from service.maps.calibration import RIGHT_M
 from service.maps.reader import MapBundle
-from service.retrieval.prior import Prior
 
 DRIVES = ("kitti_0005", "kitti_0013")
 QUERIES = "recorded"
@@ -241,16 +240,6 @@ def _stage_rows(report: Report, street: Street) -> None:
     report.row(f"real.{street.name}.inliers_from_truth", float(np.median(from_truth)), "share", n=len(from_truth))
 
 
-def prior_at(T_map_camera: Transform, rng: np.random.Generator) -> Prior:
-    """Return a prior whose error agrees with its standard deviation.
-
-    Args:
-        T_map_camera: true pose of the camera (4, 4).
-        rng: source of the error.
-    """
-    return Prior(position_m=T_map_camera[:2, 3] + rng.normal(0, PRIOR_M, 2), position_std_m=PRIOR_M)
-
-
 def prior_rows(report: Report, name: str, dataset: Dataset, localizer: Localizer) -> None:
     """Add the rows ``real.NAME.prior_3_m.*``: each query has a prior near its true position.
 
@@ -260,7 +249,7 @@ def prior_rows(report: Report, name: str, dataset: Dataset, localizer: Localizer
         dataset: its dataset.
         localizer: localizer of its map.
     """
-    found = predict(localizer, dataset, QUERIES, prior_of=prior_at)
+    found = predict(localizer, dataset, QUERIES, prior_of=prior_with_std(PRIOR_M))
     status_rows(report, f"real.{name}.prior_3_m", position_errors(found), found.localized, bars=(None, None, None))
 
 

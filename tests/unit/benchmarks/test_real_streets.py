@@ -12,7 +12,7 @@ from benchmarks.real.confidence import (
     with_correction,
 )
 from benchmarks.real.peers import pooled_rows
-from benchmarks.real.streets import PRIOR_M, answer_rows, prior_at, status_rows
+from benchmarks.real.streets import answer_rows, status_rows
 from benchmarks.real.variants import EveryScan, grey
 from benchmarks.report import Report
 from model_training.datasets.dataset import Dataset
@@ -99,12 +99,6 @@ def test_a_grey_image_has_three_equal_channels():
     found = grey(Query(rgb=rgb, depth_m=np.ones((2, 2), np.float32), camera=camera)).rgb
     assert found.dtype == np.uint8
     np.testing.assert_array_equal(found, np.full((2, 2, 3), 59))  # 0.587 of green
-
-
-def test_a_prior_is_off_by_its_standard_deviation():
-    rng = np.random.default_rng(0)
-    off = np.array([prior_at(np.eye(4), rng).position_m for _ in range(4000)], np.float64)
-    np.testing.assert_allclose(off.std(axis=0), np.full(2, PRIOR_M), rtol=0.05)
 
 
 def test_drives_are_pooled_by_their_queries_and_ours_must_be_higher(tmp_path):
