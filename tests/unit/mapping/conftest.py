@@ -1,4 +1,4 @@
-"""A drive in two halves, their maps, and the map of the whole drive."""
+"""A drive in two halves, their maps, the map of the whole drive, and a copy of its survey on an S3 server."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -9,9 +9,11 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from benchmarks.scale.s3_server import BUCKET
 from model_training.datasets.dataset import Dataset
 from model_training.mapping.build import build_map
 from model_training.mapping.settings import BuildSettings
+from service.maps.store.remote import Remote
 
 #: Its poses are exact, and what is merged is compared with what is built at once; bringing scans into agreement has tests of its own.
 #: Without places between scans: two halves lack the ones between them.
@@ -66,3 +68,17 @@ def map_of(encoder_file: Path, tmp_path_factory: pytest.TempPathFactory) -> Call
 @pytest.fixture(scope="session")
 def half_maps(halves: tuple[Dataset, Dataset], map_of: Callable[..., Path]) -> tuple[Path, Path]:
     return map_of(halves[0]), map_of(halves[1])
+
+
+@pytest.fixture
+def survey_url(small_dataset: Any, s3: dict[str, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> str:
+    """Return the URL of a copy of the survey on an S3 server. Processes that start later find the credentials."""
+    for key, value in s3.items():
+        monkeypatch.setenv(key, value)
+    url = f"s3://{BUCKET}/{tmp_path.name}/survey"
+    remote = Remote.open(url)
+    for name in ("dataset.json", "streets.geojson", "survey/poses.txt"):
+        remote.put(name, small_dataset.folder / name)
+    for name, *_ in small_dataset.scan_files():
+        remote.put(f"survey/scans/{name}", small_dataset.folder / "survey" / "scans" / name)
+    return url

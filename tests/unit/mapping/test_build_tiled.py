@@ -18,7 +18,6 @@ import pytest
 import typer
 from scipy.spatial import cKDTree
 
-from benchmarks.scale.s3_server import BUCKET
 from model_training.cli.build_map import command
 from model_training.datasets.dataset import Dataset
 from model_training.datasets.stored_survey import dataset_at
@@ -35,7 +34,6 @@ from model_training.mapping.work import work_folder
 from service.errors import BundleError, DatasetError, ExtraMissingError
 from service.maps.manifest import read_manifest
 from service.maps.reader import MapBundle
-from service.maps.store.remote import Remote
 from service.retrieval.encoder import Encoder
 
 #: 11 scans along 60 m; the map frame's axes cut them into two tiles.
@@ -288,21 +286,6 @@ def test_processes_give_the_same_bytes_although_one_is_killed(small_dataset, enc
     assert files_of(out) == undisturbed
     assert len(killed) == len(said) == 1
     assert "its process was killed by SIGKILL (is the memory full?); the tile goes on in another process" in said[0]
-
-
-@pytest.fixture
-def survey_url(small_dataset, s3, tmp_path, monkeypatch):
-    """Return the URL of a copy of the survey on an S3 server."""
-    for key, value in s3.items():
-        monkeypatch.setenv(key, value)
-    url = f"s3://{BUCKET}/{tmp_path.name}/survey"
-    remote = Remote.open(url)
-    for name in ("dataset.json", "streets.geojson", "survey/poses.txt"):
-        if (small_dataset.folder / name).exists():
-            remote.put(name, small_dataset.folder / name)
-    for name, *_ in small_dataset.scan_files():
-        remote.put(f"survey/scans/{name}", small_dataset.folder / "survey" / "scans" / name)
-    return url
 
 
 def test_a_survey_in_object_storage_gives_the_same_map(survey_url, encoder_file, undisturbed, serial, tmp_path):

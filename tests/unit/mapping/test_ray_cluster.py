@@ -72,8 +72,8 @@ def start(cluster: Any, small_dataset: Any, encoder_file: Path, tmp_path: Path) 
     """Return what starts a build as a user does, in a process of its own."""
     started: list[subprocess.Popen[str]] = []
 
-    def build(name: str, engine: str = "ray") -> "subprocess.Popen[str]":
-        command = [sys.executable, "-c", BUILD, "build-map", str(small_dataset.folder), "--out", str(tmp_path / name)]
+    def build(name: str, engine: str = "ray", survey: str = str(small_dataset.folder)) -> "subprocess.Popen[str]":
+        command = [sys.executable, "-c", BUILD, "build-map", survey, "--out", str(tmp_path / name)]
         command += [
             "--encoder",
             str(encoder_file),
@@ -140,3 +140,15 @@ def test_a_killed_driver_loses_and_duplicates_nothing(
     assert process.returncode == 0, said
     assert files_of(tmp_path / "m") == undisturbed
     assert not work_folder(tmp_path / "m").exists()
+
+
+def test_the_nodes_fetch_a_survey_from_object_storage(
+    survey_url: str, start: Callable[..., Any], undisturbed: dict[str, bytes], tmp_path: Path
+) -> None:
+    """One task is killed after it has begun. Another one fetches what is missing."""
+    process = start("m", survey=survey_url)
+    os.kill(until(running_tasks)[0], signal.SIGKILL)
+    _, said = process.communicate(timeout=300)
+    assert process.returncode == 0, said
+    assert files_of(tmp_path / "m") == undisturbed
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["local", "m"]
