@@ -11,9 +11,13 @@ from model_training.datasets.dataset import MOST_SURVEY_STD_DEG, MOST_SURVEY_STD
 from model_training.datasets.stored_survey import StoredSurvey, dataset_at
 from model_training.mapping.build import build_map, describe, require_new
 from model_training.mapping.build_tiled import build_tiled
-from model_training.mapping.engines import Engine
+from model_training.mapping.calibration_file import calibration_for
+from model_training.mapping.engines import Engine, require_engine
 from model_training.mapping.settings import BuildSettings
+from model_training.mapping.survey import kept_scans
+from model_training.mapping.tiles import require_tile_edge
 from model_training.stock import CALIBRATION, ENCODER
+from service.retrieval.encoder import Encoder
 
 
 def command(
@@ -139,6 +143,12 @@ def command(
         for option, value in (("--engine", engine), ("--workers", workers)):
             if value is not None:
                 raise typer.BadParameter("it builds tiles; give --tile-m too", param_hint=option)
+    # What can be refused is refused before scans are fetched.
+    require_new(out, name or "unnamed", overwrite=overwrite)
+    calibration_for(calibration, Encoder.open(encoder).sha256)
+    if tile_m is not None:
+        require_tile_edge(tile_m)
+        require_engine(engine or "local", workers)
     with bars() as report, dataset_at(dataset, out) as opened:
         settings = BuildSettings(
             name=name or opened.name,
@@ -156,9 +166,8 @@ def command(
             survey_std_m=survey_std_m,
             survey_std_deg=survey_std_deg,
         )
-        require_new(out, settings.name, overwrite=overwrite)  # before scans are fetched
         if isinstance(opened, StoredSurvey) and tile_m is None:
-            opened.fetch_all(report)
+            opened.fetch(kept_scans(opened, settings)[1], report)
         if tile_m is None:
             manifest = build_map(opened, encoder, out, settings, overwrite=overwrite, report=report)
         else:

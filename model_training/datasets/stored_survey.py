@@ -1,13 +1,16 @@
 """A dataset in object storage. Its files are fetched into a folder of this machine when they are needed."""
 
+import fcntl
 import os
 import shutil
-from collections.abc import Callable, Iterable, Iterator
+import threading
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import partial
 from hashlib import sha256
 from pathlib import Path
+from typing import Any, BinaryIO
 from uuid import uuid4
 
 import numpy as np
@@ -21,6 +24,7 @@ from service.maps.store.remote import Content, Remote, StoredFile, is_url
 
 DATASET = Content("a dataset", "copy the dataset there (docs/maps.md)", "dataset")
 _DESCRIPTION, _STREETS, _POSES, _SCANS = "dataset.json", "streets.geojson", "survey/poses.txt", "survey/scans"
+_LOCK, _STATE = "lock", "state"
 _MB = 10**6
 
 #: Progress callback: stage, number done, number of all.
@@ -28,88 +32,154 @@ Report = Callable[[str, int, int], None]
 
 
 @dataclass(frozen=True, slots=True)
-class _Files:
-    """The files of a dataset in object storage, and the folder of this machine that gets them.
+class StoredSource:
+    """A survey in object storage, or a part of it. It can be pickled.
 
     Attributes:
         url: URL of the dataset.
-        listed: scans of the survey, as the store lists them, by the names of their files.
-        folder: folder for the fetched files.
+        files: description, streets and poses of the dataset as the store lists them, by their paths in the dataset.
+        scans: scans of the part as the store lists them, by the names of their files.
     """
 
     url: str
-    listed: dict[str, StoredFile]
-    folder: Path
+    files: Mapping[str, StoredFile]
+    scans: Mapping[str, StoredFile]
 
-    def fetch_small(self, *names: str, required: bool = True) -> None:
-        """Fetch files other than scans, unless they are there.
+    @classmethod
+    def found(cls, url: str) -> "StoredSource":
+        """Look at a dataset in a store.
 
         Args:
-            names: paths in the dataset.
-            required: whether the dataset must have them.
+            url: URL of the dataset.
 
         Raises:
-            DatasetError: a required file is missing, or a file cannot be read or written.
+            BundleError: the dataset has no description or no poses, or the store cannot be read.
+            ExtraMissingError: obstore is not installed.
         """
-        with _dataset_errors(self.folder):
-            remote = Remote.open(self.url, content=DATASET)
-            for name in names:
-                path = self.folder / name
-                if path.exists():
-                    continue
-                data = remote.read_if_there(name)
-                if data is None and required:
-                    raise BundleError(
-                        f"{self.url}/{name} is missing in the store; check the URL, or {DATASET.remedy}", field=name
-                    )
-                if data is not None:
-                    with _written(path) as part:
-                        part.write_bytes(data)
+        remote = Remote.open(url, content=DATASET)
+        found = {name: remote.look(name) for name in (_DESCRIPTION, _STREETS, _POSES)}
+        for name in (_DESCRIPTION, _POSES):
+            if found[name] is None:
+                raise BundleError(
+                    f"{remote.url}/{name} is missing in the store; check the URL, or {DATASET.remedy}", field=name
+                )
+        scans = {file.name.rpartition("/")[2]: file for file in remote.files(_SCANS)}
+        return cls(remote.url, {name: file for name, file in found.items() if file is not None}, scans)
 
-    def fetch_scans(self, numbers: Iterable[int], report: Report = lambda *_: None) -> None:
-        """Fetch scans, unless they are there. A scan that the store lacks stays missing.
+    @property
+    def state(self) -> str:
+        """Hash of the names, sizes, times and ETags of all files."""
+        digest = sha256(self.url.encode())
+        for file in (*self.files.values(), *self.scans.values()):
+            digest.update(repr(file).encode())
+        return digest.hexdigest()
+
+    def of(self, numbers: NDArray[np.int64]) -> "StoredSource":
+        """Return a part of the survey.
 
         Args:
+            numbers: indices of the scans of the part (n,).
+        """
+        names = (scan_path(Path(), int(number)).name for number in numbers)
+        return StoredSource(self.url, self.files, {name: self.scans[name] for name in names if name in self.scans})
+
+    def part(self, numbers: NDArray[np.int64], poses: Transforms, *, scratch: Path) -> SurveyPart:
+        """Open the part, as ``PartSource.part``.
+
+        Args:
+            numbers: indices of the scans in the survey, ascending (n,).
+            poses: their T_map_lidar (n, 4, 4), metres.
+            scratch: folder for the fetched files.
+
+        Raises:
+            DatasetError: the dataset cannot be opened.
+        """
+        return StoredSurveyPart(self, scratch, numbers, poses)
+
+    def fetch_small(self, folder: Path, name: str) -> None:
+        """Fetch a file other than a scan, unless it is there or the dataset has none.
+
+        Args:
+            folder: folder for the fetched files.
+            name: path in the dataset.
+
+        Raises:
+            DatasetError: the file has changed since it was listed, or cannot be read or written.
+        """
+        path = folder / name
+        if name in self.files and not path.exists():
+            with _dataset_errors(folder):
+                remote = Remote.open(self.url, content=DATASET)
+                with _written(path) as stream:
+                    remote.save_listed(self.files[name], stream, on_bytes=lambda _: None)
+
+    def fetch_scans(self, folder: Path, numbers: Iterable[int], report: Report = lambda *_: None) -> None:
+        """Fetch scans, several at a time, unless they are there. A scan that the store lacks stays missing.
+
+        Args:
+            folder: folder for the fetched files.
             numbers: numbers of the scans in the whole survey.
             report: called with the fetched MB.
 
         Raises:
             DatasetError: a scan has changed since it was listed, or cannot be read or written.
         """
-        paths = [scan_path(self.folder, number) for number in numbers]
-        wanted = {path: self.listed[path.name] for path in paths if path.name in self.listed and not path.exists()}
+        paths = [scan_path(folder, number) for number in numbers]
+        listed = {path: self.scans[path.name] for path in paths if path.name in self.scans}
+        wanted = {path: file for path, file in listed.items() if not _has_size(path, file.size)}
         if not wanted:
             return
-        total, done = sum(file.size for file in wanted.values()), 0
-
-        def count(go_on: Callable[[], None], size: int) -> None:
-            nonlocal done
-            go_on()
-            done += size
-            report("fetching scans (MB)", done // _MB, total // _MB)
+        progress = _Progress(sum(file.size for file in wanted.values()), report)
 
         def fetch(path: Path, file: StoredFile, go_on: Callable[[], None]) -> None:
-            with _written(path) as part, part.open("wb") as stream:
-                remote.save_listed(file, stream, on_bytes=partial(count, go_on))
+            def count(size: int) -> None:
+                go_on()
+                progress.add(size)
 
-        with _dataset_errors(self.folder):
+            with _written(path) as stream:
+                remote.save_listed(file, stream, on_bytes=count)
+
+        with _dataset_errors(folder):
             remote = Remote.open(self.url, content=DATASET)
             concurrently(partial(fetch, path, file) for path, file in wanted.items())
 
 
-class _Stored(Dataset):
-    """A dataset whose scans and poses are fetched when they are read."""
+class _Progress:
+    """Add up the fetched bytes of several threads."""
 
-    _files: _Files
+    def __init__(self, total: int, report: Report) -> None:
+        self._total, self._report, self._done, self._lock = total, report, 0, threading.Lock()
+
+    def add(self, size: int) -> None:
+        with self._lock:
+            self._done += size
+            self._report("fetching scans (MB)", self._done // _MB, self._total // _MB)
+
+
+class _Stored(Dataset):
+    """A dataset whose files are fetched when they are read. Errors name the URL and not the fetched copy."""
+
+    source: StoredSource
+
+    def streets(self) -> dict[str, Any] | None:
+        """Return the GeoJSON of the streets, or None if the dataset has none.
+
+        Raises:
+            DatasetError: the file is not JSON, or cannot be fetched.
+        """
+        self.source.fetch_small(self.folder, _STREETS)
+        with self._naming_url():
+            return super().streets()
 
     def survey_trajectory(self) -> tuple[NDArray[np.float64], Transforms]:
         """Return the time (n,) in seconds and T_map_lidar (n, 4, 4) in metres of every scan.
 
         Raises:
-            DatasetError: the pose file is missing or damaged, or cannot be fetched.
+            DatasetError: the pose file is damaged, or cannot be fetched.
         """
-        self._files.fetch_small(_POSES)
-        return super().survey_trajectory()
+        self.source.fetch_small(self.folder, _POSES)
+        with self._naming_url():
+            return super().survey_trajectory()
 
     def scan(self, number: int) -> NDArray[np.float32]:
         """Return a scan (n, 4), as ``Dataset.scan``.
@@ -121,72 +191,53 @@ class _Stored(Dataset):
             DatasetError: the file is missing, truncated or has changed, or cannot be fetched.
         """
         name = scan_path(self.folder, number).name
-        if name not in self._files.listed:
+        if name not in self.source.scans:
             raise DatasetError(
-                f"{self._files.url}/{_SCANS}/{name} is missing, but {_POSES} has a line for it; {DATASET.remedy}",
+                f"{self.source.url}/{_SCANS}/{name} is missing, but {_POSES} has a line for it; {DATASET.remedy}",
                 field=name,
             )
-        self._files.fetch_scans([number])
-        return super().scan(number)
+        self.source.fetch_scans(self.folder, [number])
+        with self._naming_url():
+            return super().scan(number)
+
+    @contextmanager
+    def _naming_url(self) -> Iterator[None]:
+        with _naming(self.source.url, self.folder):
+            yield
 
 
 class StoredSurvey(_Stored):
     """A dataset in object storage: its description, its streets and its survey. Its queries stay in the store.
 
     Args:
-        url: URL of the dataset, such as ``s3://bucket/surveys/town``.
-        beside: the fetched files go into ``.NAME.survey-HASH`` beside this path. A folder of another state of the survey is deleted.
+        source: the dataset.
+        folder: folder for the fetched files.
 
     Raises:
-        DatasetError: the dataset is incomplete, or the store cannot be read.
-        ExtraMissingError: obstore is not installed.
+        DatasetError: the dataset cannot be opened.
     """
 
-    def __init__(self, url: str, beside: Path) -> None:
-        with _dataset_errors(beside):
-            remote = Remote.open(url, content=DATASET)
-            listed = {Path(file.name).name: file for file in remote.files(_SCANS)}
-            small = [remote.read_if_there(name) for name in (_DESCRIPTION, _STREETS, _POSES)]
-        state = sha256(repr((remote.url, sorted(listed.items()), small)).encode()).hexdigest()[:12]
-        prefix = f".{beside.name}.survey-"
-        folder = beside.parent / f"{prefix}{state}"
-        for other in beside.parent.glob(f"{prefix}*"):
-            if other != folder:
-                shutil.rmtree(other)
-        self._files = _Files(remote.url, listed, folder)
-        self._files.fetch_small(_DESCRIPTION)
-        self._files.fetch_small(_STREETS, required=False)
-        super().__init__(folder)
+    def __init__(self, source: StoredSource, folder: Path) -> None:
+        self.source = source
+        source.fetch_small(folder, _DESCRIPTION)
+        with _naming(source.url, folder):
+            super().__init__(folder)
 
     def scan_files(self) -> Iterator[ScanFile]:
         """Yield the files of the scans, sorted by name."""
-        for name, file in sorted(self._files.listed.items()):
-            yield name, file.size, file.modified_ns
+        return _scan_files(self.source, sorted(self.source.scans))
 
-    def fetch_all(self, report: Report = lambda *_: None) -> None:
-        """Fetch all scans, several at a time.
+    def fetch(self, numbers: NDArray[np.int64], report: Report = lambda *_: None) -> None:
+        """Fetch scans, several at a time.
 
         Args:
+            numbers: numbers of the scans (n,).
             report: called with the fetched MB.
 
         Raises:
             DatasetError: a scan has changed since the command began, or cannot be read or written.
         """
-        self._files.fetch_scans(range(len(self.survey_poses())), report)
-
-    def source_of(self, numbers: NDArray[np.int64]) -> "StoredSource":
-        """Return the source of a part of the survey.
-
-        Args:
-            numbers: indices of the scans of the part (n,).
-        """
-        names = [scan_path(self.folder, int(number)).name for number in numbers]
-        listed = self._files.listed
-        return StoredSource(self._files.url, tuple(listed[name] for name in names if name in listed))
-
-    def remove_fetched(self) -> None:
-        """Delete the folder with the fetched files."""
-        shutil.rmtree(self._files.folder, ignore_errors=True)
+        self.source.fetch_scans(self.folder, numbers.tolist(), report)
 
 
 class StoredSurveyPart(SurveyPart, _Stored):
@@ -202,18 +253,15 @@ class StoredSurveyPart(SurveyPart, _Stored):
         DatasetError: the dataset cannot be opened.
     """
 
-    def __init__(self, source: "StoredSource", folder: Path, numbers: NDArray[np.int64], poses: Transforms) -> None:
-        self._files = _Files(source.url, {Path(file.name).name: file for file in source.files}, folder)
-        self._files.fetch_small(_DESCRIPTION)
-        self._files.fetch_small(_STREETS, required=False)
-        super().__init__(folder, numbers, poses)
+    def __init__(self, source: StoredSource, folder: Path, numbers: NDArray[np.int64], poses: Transforms) -> None:
+        self.source = source
+        source.fetch_small(folder, _DESCRIPTION)
+        with _naming(source.url, folder):
+            super().__init__(folder, numbers, poses)
 
     def scan_files(self) -> Iterator[ScanFile]:
         """Yield the files of the scans of the part that the store has, in their order."""
-        for number in self._numbers:
-            file = self._files.listed.get(scan_path(self.folder, int(number)).name)
-            if file is not None:
-                yield Path(file.name).name, file.size, file.modified_ns
+        return _scan_files(self.source, (scan_path(self.folder, int(number)).name for number in self._numbers))
 
     def prepare(self) -> None:
         """Fetch the scans of the part, several at a time.
@@ -221,37 +269,11 @@ class StoredSurveyPart(SurveyPart, _Stored):
         Raises:
             DatasetError: a scan has changed since it was listed, or cannot be read or written.
         """
-        self._files.fetch_scans(int(number) for number in self._numbers)
+        self.source.fetch_scans(self.folder, self._numbers.tolist())
 
     def release(self) -> None:
         """Delete the fetched files."""
-        shutil.rmtree(self._files.folder, ignore_errors=True)
-
-
-@dataclass(frozen=True, slots=True)
-class StoredSource:
-    """A part of a survey in object storage. It can be pickled.
-
-    Attributes:
-        url: URL of the dataset.
-        files: the scans of the part that the store has.
-    """
-
-    url: str
-    files: tuple[StoredFile, ...]
-
-    def part(self, numbers: NDArray[np.int64], poses: Transforms, *, scratch: Path) -> SurveyPart:
-        """Open the part, as ``PartSource.part``.
-
-        Args:
-            numbers: indices of the scans in the survey, ascending (n,).
-            poses: their T_map_lidar (n, 4, 4), metres.
-            scratch: folder for the fetched files.
-
-        Raises:
-            DatasetError: the dataset cannot be opened.
-        """
-        return StoredSurveyPart(self, scratch, numbers, poses)
+        shutil.rmtree(self.folder, ignore_errors=True)
 
 
 def source_of(dataset: Dataset, numbers: NDArray[np.int64]) -> PartSource:
@@ -261,42 +283,119 @@ def source_of(dataset: Dataset, numbers: NDArray[np.int64]) -> PartSource:
         dataset: the dataset.
         numbers: indices of the scans of the part (n,).
     """
-    return dataset.source_of(numbers) if isinstance(dataset, StoredSurvey) else FolderSource(dataset.folder.resolve())
+    return dataset.source.of(numbers) if isinstance(dataset, StoredSurvey) else FolderSource(dataset.folder.resolve())
 
 
 @contextmanager
 def dataset_at(place: str, out: Path) -> Iterator[Dataset]:
     """Open a dataset in a folder or in object storage.
 
-    What was fetched is deleted at the end. After an error it stays, so that the next run continues with it.
+    Files from a store go into ``.NAME.survey`` beside ``out``, and are deleted at the end. After an error, the scans stay, so that the next
+    run continues with them. Scans of another state of the dataset are deleted first.
 
     Args:
         place: folder, or URL.
-        out: folder of the result. Fetched files go beside it.
+        out: folder of the result.
 
     Raises:
-        DatasetError: the dataset is incomplete, or the store cannot be read.
+        DatasetError: the dataset is incomplete, another process uses the folder, or the store cannot be read.
         ExtraMissingError: obstore is not installed.
     """
     if not is_url(place):
         yield Dataset(Path(place))
         return
-    stored = StoredSurvey(place, out)
-    yield stored
-    stored.remove_fetched()
+    folder = out.parent / f".{out.name}.survey"
+    with _dataset_errors(folder):
+        source = StoredSource.found(place)
+    with _held(folder, source.state):
+        yield StoredSurvey(source, folder)
 
 
 @contextmanager
-def _written(path: Path) -> Iterator[Path]:
-    """Yield a new path in the same folder. It gets its name at the end, or disappears after an error."""
+def _held(folder: Path, state: str) -> Iterator[None]:
+    """Hold a folder for fetched files. The system releases it however the process ends.
+
+    Args:
+        folder: the folder; created if it is missing. Files of another state are deleted.
+        state: hash of what will be fetched.
+
+    Raises:
+        DatasetError: another process holds the folder, or it cannot be written.
+    """
+    with _dataset_errors(folder):
+        folder.mkdir(parents=True, exist_ok=True)
+        lock = os.open(folder / _LOCK, os.O_RDWR | os.O_CREAT, 0o644)
+    try:
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            raise DatasetError(
+                f"{folder} is used by another process that builds this map; wait for it, or choose another --out",
+                field="out",
+            ) from error
+        with _dataset_errors(folder):
+            kept = folder / _STATE
+            if not (kept.is_file() and kept.read_text() == state):
+                _empty(folder)
+                kept.write_text(state)
+        try:
+            yield
+        except BaseException:
+            if not any((folder / _SCANS).glob("*")):  # nothing is worth keeping
+                shutil.rmtree(folder, ignore_errors=True)
+            raise
+        shutil.rmtree(folder, ignore_errors=True)
+    finally:
+        os.close(lock)
+
+
+def _empty(folder: Path) -> None:
+    """Delete everything in a folder but its lock."""
+    for path in folder.iterdir():
+        if path.is_dir():
+            shutil.rmtree(path)
+        elif path.name != _LOCK:
+            path.unlink()
+
+
+def _scan_files(source: StoredSource, names: Iterable[str]) -> Iterator[ScanFile]:
+    for name in names:
+        file = source.scans.get(name)
+        if file is not None:
+            yield name, file.size, file.modified_ns
+
+
+def _has_size(path: Path, size: int) -> bool:
+    """Return whether a file is there as a whole. After a crash of the machine it may be shorter."""
+    try:
+        return path.stat().st_size == size
+    except FileNotFoundError:
+        return False
+
+
+@contextmanager
+def _written(path: Path) -> Iterator[BinaryIO]:
+    """Open a new file in the same folder. It gets its name at the end, or disappears after an error."""
     part = path.with_name(f".{path.name}.{os.getpid()}-{uuid4().hex[:8]}")
     path.parent.mkdir(parents=True, exist_ok=True)
     try:
-        yield part
+        with part.open("wb") as stream:
+            yield stream
         part.rename(path)
     finally:
         with suppress(FileNotFoundError):
             part.unlink()
+
+
+@contextmanager
+def _naming(url: str, folder: Path) -> Iterator[None]:
+    """Let errors of the dataset name its URL and not the folder of the fetched files."""
+    try:
+        yield
+    except DatasetError as error:
+        if str(folder) not in error.message:
+            raise
+        raise DatasetError(f"{error.message.replace(str(folder), url)}; {DATASET.remedy}", field=error.field) from error
 
 
 @contextmanager

@@ -1,6 +1,7 @@
 """Build one tile of a tiled map. The result depends on nothing but the task, so any process on any machine may build it."""
 
 import json
+import shutil
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -141,7 +142,10 @@ def build_tile(task: TileTask, share: Share = lambda _: None) -> None:
         EncoderError: the encoder cannot be used.
         BundleError: the bundle cannot be written, or this process sees other inputs than the one that planned the tiles.
     """
-    with threadpool_limits(limits=THREADS):
+    with threadpool_limits(limits=THREADS), work_beside(task.folder, task.key, wait_s=_WAIT_S) as work:
+        if task.is_finished:  # by an earlier attempt that this one has just waited for
+            shutil.rmtree(task.scratch, ignore_errors=True)
+            return
         dataset = task.dataset.part(task.numbers, task.poses, scratch=task.scratch)
         encoder = Encoder.open(task.encoder_file, threads=THREADS)
         if key_of_tile(dataset, encoder.sha256, task.settings, task.part, task.common) != task.key:
@@ -154,33 +158,28 @@ def build_tile(task: TileTask, share: Share = lambda _: None) -> None:
         at_scan = np.flatnonzero(task.part.plan.at_scan)
         apart = set() if calibration is None else set(at_scan[sorted(held_out(len(at_scan)))].tolist())
         kept = np.arange(len(task.numbers))
-        with work_beside(task.folder, task.key, wait_s=_WAIT_S) as work:
-            if task.is_finished:  # by an earlier attempt that this one has just waited for
-                return
-            dataset.prepare()
-            stages = ResumedStages(
-                work, dataset, kept, task.settings, shares_of_stages(task.settings, share), task.part
-            )
-            drive = Drive(
-                dataset,
-                stages.poses(task.poses),
-                kept,
-                task.settings,
-                encoder,
-                ViewGrid(rows=encoder.rows, columns=encoder.columns),
-                task.common.rows_seen,
-                task.part,
-            )
-            write_from(
-                stages,
-                drive,
-                task.encoder_file,
-                task.folder,
-                calibration,
-                apart,
-                lidar_height_m=task.common.lidar_height_m,
-            )
-            dataset.release()
+        dataset.prepare()
+        stages = ResumedStages(work, dataset, kept, task.settings, shares_of_stages(task.settings, share), task.part)
+        drive = Drive(
+            dataset,
+            stages.poses(task.poses),
+            kept,
+            task.settings,
+            encoder,
+            ViewGrid(rows=encoder.rows, columns=encoder.columns),
+            task.common.rows_seen,
+            task.part,
+        )
+        write_from(
+            stages,
+            drive,
+            task.encoder_file,
+            task.folder,
+            calibration,
+            apart,
+            lidar_height_m=task.common.lidar_height_m,
+        )
+        dataset.release()
 
 
 def shares_of_stages(settings: BuildSettings, share: Share) -> Callable[[str, int, int], None]:

@@ -39,8 +39,8 @@ def concurrently(works: Iterable[Callable[[Callable[[], None]], object]]) -> Non
             raise _StoppedError
 
     with ThreadPoolExecutor(THREADS, thread_name_prefix="streetfix-store") as pool:
-        pending = [pool.submit(work, go_on) for work in works]
         try:
+            pending = [pool.submit(work, go_on) for work in works]
             for each in as_completed(pending):
                 each.result()
         except BaseException:

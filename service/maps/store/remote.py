@@ -15,7 +15,7 @@ from service.errors import BundleError, extra_missing
 from service.maps.manifest import FILE, FileEntry
 
 if TYPE_CHECKING:
-    from obstore import GetResult
+    from obstore import GetResult, ObjectMeta
     from obstore.store import ObjectStore
 
 #: Schemes of the URLs of maps.
@@ -112,7 +112,7 @@ def checked_url(text: str, content: Content = MAP) -> str:
         raise _wrong_url(content, parts.scheme, "names no folder; write three slashes, as in file:///srv/maps/town")
     if parts.scheme != "file" and not parts.netloc:
         raise _wrong_url(content, parts.scheme, "names no bucket; write s3://BUCKET/PATH")
-    return text.rstrip("/")
+    return f"{parts.scheme}{text[len(parts.scheme) :]}".rstrip("/")
 
 
 def _scheme_of(url: str) -> str:
@@ -254,7 +254,7 @@ class Remote:
             raise self._damaged(name, "the hash does not match the manifest")
 
     def files(self, folder: str) -> list[StoredFile]:
-        """List the objects in a folder and below it, by name.
+        """List the objects in a folder, without those of its subfolders, by name.
 
         Args:
             folder: path below the URL.
@@ -263,20 +263,34 @@ class Remote:
             BundleError: the store cannot be read.
         """
         with self._naming_errors(folder):
-            found = [each for chunk in self._store.list(folder) for each in chunk]
-        return sorted(
-            (
-                StoredFile(each["path"], each["size"], round(each["last_modified"].timestamp() * 1e9), each["e_tag"])
-                for each in found
-            ),
-            key=lambda file: file.name,
-        )
+            found = [
+                _listed(each)
+                for chunk in self._store.list(folder)
+                for each in chunk
+                if each["path"].rpartition("/")[0] == folder
+            ]
+        return sorted(found, key=lambda file: file.name)
+
+    def look(self, name: str) -> StoredFile | None:
+        """Return an object without its content; None if it is missing.
+
+        Args:
+            name: path below the URL.
+
+        Raises:
+            BundleError: the store cannot be read.
+        """
+        with self._naming_errors(name):
+            try:
+                return _listed(self._store.head(name))
+            except FileNotFoundError:
+                return None
 
     def save_listed(self, file: StoredFile, target: BinaryIO, *, on_bytes: Callable[[int], object]) -> None:
         """Stream an object into an open file, if it is still the one of the list.
 
         Args:
-            file: of ``files``.
+            file: of ``files`` or ``look``.
             target: open for writing.
             on_bytes: called with the number of bytes of each piece. It may raise to end the transfer.
 
@@ -294,11 +308,17 @@ class Remote:
                 found = self._store.get(file.name, options={"if_match": file.e_tag} if file.e_tag else None)
             except PreconditionError as error:
                 raise changed from error
-        if found.meta["size"] != file.size:
+        if not _is_same(_listed(found.meta), file):
             raise changed
+        read = 0
         for chunk in self._chunks(file.name, found):
+            read += len(chunk)
             target.write(chunk)
             on_bytes(len(chunk))
+        # An object in a bucket is replaced as a whole. A file may be written over while it is read.
+        now = self.look(file.name) if _scheme_of(self.url) == "file" else file
+        if read != file.size or now is None or not _is_same(now, file):
+            raise changed
 
     def put(self, name: str, content: bytes | Path) -> None:
         """Store an object. Readers see the whole object or the one before.
@@ -345,6 +365,19 @@ class Remote:
             raise BundleError(f"{self.url}/{name} {problem}; {remedy}", field=name) from error
         except (BaseError, OSError, ValueError) as error:
             raise _failed(f"{self.url}/{name}", what, error) from error
+
+
+def _listed(meta: "ObjectMeta") -> StoredFile:
+    return StoredFile(meta["path"], meta["size"], round(meta["last_modified"].timestamp() * 1e9), meta["e_tag"])
+
+
+def _is_same(one: StoredFile, other: StoredFile) -> bool:
+    """Return whether two lists show the same content: by size and ETag; by size and time, to the second, without an ETag."""
+    if one.size != other.size:
+        return False
+    if one.e_tag and other.e_tag:  # some stores quote it in one answer only
+        return one.e_tag.strip('"') == other.e_tag.strip('"')
+    return abs(one.modified_ns - other.modified_ns) < 10**9
 
 
 def _failed(url: str, what: str, error: Exception) -> BundleError:

@@ -4,6 +4,7 @@ import json
 import shutil
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -246,24 +247,36 @@ def test_build_map_makes_a_bundle_that_opens(
     assert (manifest.name, manifest.headings, manifest.spacing_m, manifest.licence) == ("town", 4, 20.0, "CC0-1.0")
 
 
-def test_build_map_reads_a_survey_in_object_storage(
-    simulated: Path, encoder_file: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    """All scans come before the first stage, and go at the end. A map that exists is refused before they come."""
+def test_build_map_reads_a_survey_in_object_storage(simulated: Path, encoder_file: Path, tmp_path: Path) -> None:
     url, out = f"file://{shutil.copytree(simulated, tmp_path / 'store')}", tmp_path / "map"
     arguments = ("--encoder", encoder_file, "--spacing", "20", "--headings", "4", "--name", "town")
-    calibration = ("--calibration", tmp_path / "no.json")
-    assert run("build-map", url, "--out", out, *arguments, *calibration) == 1
-    assert "no.json cannot be read" in capsys.readouterr().err
-    assert [path.name.partition("-")[0] for path in tmp_path.glob(".map.*")] == [".map.survey"]
     assert run("build-map", simulated, "--out", tmp_path / "local", *arguments) == 0
     assert run("build-map", url, "--out", out, *arguments) == 0
     one, other = (MapBundle.open(path) for path in (out, tmp_path / "local"))
     assert one.manifest.version == other.manifest.version
     assert not list(tmp_path.glob(".map.*"))
-    assert run("build-map", url, "--out", out, *arguments) == 1
-    assert "already exists" in capsys.readouterr().err
-    assert not list(tmp_path.glob(".map.*/survey/scans"))
+
+
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        (("--calibration", "no.json"), "no.json cannot be read"),
+        (("--encoder", "no.onnx"), "no.onnx"),
+        (("--name", "a b"), "name: 'a b' cannot name a map"),
+        (("--tile-m", "3"), "tile_m"),
+        ((), "already exists"),
+    ],
+)
+def test_build_map_refuses_before_it_fetches(
+    simulated: Path, encoder_file: Path, tmp_path: Path, wrong: tuple[str, ...], message: str, capsys: Any
+) -> None:
+    if not wrong:
+        (tmp_path / "map").mkdir()
+    before = sorted(tmp_path.iterdir())
+    arguments = ("--encoder", str(encoder_file), "--spacing", "20", "--headings", "4", *wrong)
+    assert run("build-map", f"file://{simulated}", "--out", tmp_path / "map", *arguments) != 0
+    assert message in capsys.readouterr().err
+    assert sorted(tmp_path.iterdir()) == before
 
 
 def test_build_map_with_a_calibration_that_is_missing_says_what_makes_one(
