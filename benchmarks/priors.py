@@ -4,7 +4,7 @@ import numpy as np
 
 from benchmarks.plans import BOTH, unseen_plan
 from benchmarks.report import Report
-from benchmarks.runs import Runs, accepted_within, prior_with_std
+from benchmarks.runs import Runs, accepted_within, prior_with_std, within
 from benchmarks.sequences import between_landmarks, repeating_answers
 from model_training.evaluation.predict import Predictions, PriorOf
 from model_training.simulation.repeating import BLOCK_M
@@ -52,7 +52,7 @@ PRIORS: dict[str, PriorOf] = {"right": prior_with_std(STD_M), "aside": aside, "e
 
 
 def prior_rows(report: Report, runs: Runs) -> None:
-    """Add the shares of correct accepted and of wrong accepted answers: no prior, correct prior, wrong priors.
+    """Add the shares of correct accepted, correct forced and wrong accepted answers: no prior, correct prior, wrong priors.
 
     Args:
         report: collects the rows.
@@ -73,4 +73,5 @@ def prior_rows(report: Report, runs: Runs) -> None:
 def _rows(report: Report, row: str, found: Predictions) -> None:
     good = accepted_within(found, 1.0)
     report.share(f"{row}.within_1_m", good)
+    report.share(f"{row}.forced_within_1_m", within(found, 1.0))
     report.share(f"{row}.wrong_and_accepted", found.localized & ~good, better="lower")
