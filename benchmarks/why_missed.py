@@ -273,6 +273,14 @@ WHY_MISSED["rigs.worst_ece"] = Reason(
     "range. Of these answers 0.37 are right (0.26 with the encoder before). Among the fitted families the worst is the D435 "
     "(rigs.worst_fitted_ece). See rigs.rings.ece and rigs.d435.ece",
 )
+WHY_MISSED["rigs.worst_covariance_95_coverage"] = Reason(
+    0.65625,
+    "Monocular depth, whose scale errs by 8 %: it errs in height, and no number of the query shows it. See "
+    "rigs.monocular.covariance_95_coverage; without it the worst is the Kinect",
+)
+WHY_MISSED["rigs.worst_sigma_coverage_gap"] = Reason(
+    0.33404166666666674, "Monocular depth, upwards, for the same reason as rigs.worst_covariance_95_coverage"
+)
 WHY_MISSED["rigs.worst_within_1_m"] = Reason(
     0.176,
     "The worst family is the OAK-D with semi-global matching, 0.5 m above the ground: at 33 px m an error of 0.25 px is 0.8 m at 10 m. "
