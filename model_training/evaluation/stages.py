@@ -14,7 +14,7 @@ import numpy as np
 from model_training.datasets.dataset import Dataset, QueryFrame
 from model_training.evaluation.measures import RIGHT_PLACE_M
 from service.errors import DatasetError, NoDepthError
-from service.geometry.rigid import Rotation, Transform, heading_of_camera, transform_from, wrap_angle
+from service.geometry.rigid import Rotation, Transform, heading_of_camera, wrap_angle
 from service.localization.answer import Answer
 from service.localization.localizer import Localizer
 from service.localization.refine import settings_for_rig
@@ -213,8 +213,8 @@ def _level_errors(localizer: Localizer, frame: EncodedFrame, truth: Transform) -
 
 def _candidates(answer: Answer, frame: EncodedFrame) -> Iterator[tuple[Rotation, np.ndarray]]:
     for candidate in answer.candidates or ():
-        T = candidate.T_map_camera
-        yield T[:3, :3] @ frame.R_level_camera.T, T[:3, 3]
+        T = frame.pose_of_level(candidate.T_map_camera)
+        yield T[:3, :3], T[:3, 3]
 
 
 def _nearest(poses: Iterator[tuple[Rotation, np.ndarray]], truth: Transform, heading: float, most_deg: float) -> float:
@@ -246,10 +246,10 @@ def _from_truth(
     )
     if len(points) < settings.fewest_points:
         return np.inf, np.nan, np.nan
-    start = Start(truth[:3, :3] @ frame.R_level_camera.T, truth[:3, 3], 0)
+    start = Start(frame.pose_of_level(truth)[:3, :3], truth[:3, 3], 0)
     best = register(cloud, points, [start], frame.views.height_m, settings.registration)[0]
     at_truth = _inliers(cloud, points, start, frame.views.height_m, settings.registration)
-    T_map_camera = transform_from(best.R_map_level @ frame.R_level_camera, best.camera_m)
+    T_map_camera = frame.pose_of_camera(best.T_map_level)
     return float(np.hypot(*(T_map_camera[:2, 3] - truth[:2, 3]))), at_truth, best.inliers
 
 

@@ -9,7 +9,6 @@ from numpy.typing import NDArray
 from service.confidence.decision import Decision, outcome_of
 from service.confidence.spread import Extent
 from service.geometry.rigid import Transform, inverse, transform_from
-from service.imaging.query_view import QueryViews
 from service.localization.answer import Answer, Timings, require_finite
 from service.maps.map import Map
 from service.retrieval.hypotheses import Hypothesis
@@ -58,7 +57,7 @@ def compose(bundle: Map, frames: tuple[EncodedFrame, ...], found: QueryResult, e
             calibration, frames[0].query, refined, evidence, decision, frames=len(frames), extent=extent
         )
     query, views, heaviest = frames[0].query, frames[0].views, retrieved.hypotheses[0]
-    T_map_camera = _pose_of(bundle, heaviest, views) if refined is None else refined.best.T_map_camera
+    T_map_camera = _pose_of(bundle, heaviest, frames[0]) if refined is None else refined.best.T_map_camera
     count = max(query.neighbours, query.ranked)
     answer = Answer(
         status=outcome.status,
@@ -108,11 +107,11 @@ def _street_of(bundle: Map, T_map_camera: Transform, heaviest: Hypothesis, *, re
     return bundle.streets.index_at(T_map_camera[:2, 3]) if registered else heaviest.street
 
 
-def _pose_of(bundle: Map, hypothesis: Hypothesis, views: QueryViews) -> Transform:
+def _pose_of(bundle: Map, hypothesis: Hypothesis, frame: EncodedFrame) -> Transform:
     """Return T_map_camera at a hypothesis. The position of a hypothesis is at LiDAR height, so it is moved to camera height."""
-    above_lidar_m = views.height_m - bundle.manifest.lidar_height_m
+    above_lidar_m = frame.views.height_m - bundle.manifest.lidar_height_m
     position_m = hypothesis.position_m + np.array([0.0, 0.0, above_lidar_m])
-    return transform_from(hypothesis.R_map_level @ views.R_level_camera, position_m)
+    return frame.pose_of_camera(transform_from(hypothesis.R_map_level, position_m))
 
 
 def reranked(neighbours: tuple[Neighbour, ...], candidates: tuple[Candidate, ...]) -> tuple[Neighbour, ...]:

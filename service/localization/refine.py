@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float64
 from numpy.typing import NDArray
 
-from service.geometry.rigid import Transform, heading_of_camera, transform_from
+from service.geometry.rigid import Transform, heading_of_camera
 from service.maps.map import Map
 from service.registration.covariance import (
     OF_POINTS,
@@ -213,7 +213,7 @@ def _adjusted(
         scatter = score_outer_product(cloud.at(pose.camera_m), points, pose, settings.registration)
     else:
         pose, scatter = adjusted
-    T_map_camera = transform_from(pose.R_map_level @ scorer.measured[0].frame.R_level_camera, pose.camera_m)
+    T_map_camera = scorer.measured[0].frame.pose_of_camera(pose.T_map_level)
     heading, confirmation = heading_of_camera(T_map_camera), confirm(cloud, scorer.structure, pose)
     if adjusted is None:
         covariance = covariance_of(pose.information, scatter, noise, heading, OF_POINTS)
@@ -239,7 +239,7 @@ def _starts_at(
     """Return predicted poses T_map_camera of the reference as starts, numbered from ``first``."""
     if not predicted:
         return []
-    T_map_level = np.stack([transform_from(T[:3, :3] @ reference.R_level_camera.T, T[:3, 3]) for T in predicted])
+    T_map_level = np.stack([reference.pose_of_level(T) for T in predicted])
     similarity, _ = similarity_of(bundle, measured, T_map_level)
     return [
         Start(T[:3, :3], T[:3, 3], first + k, float(cosine))

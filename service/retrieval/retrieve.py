@@ -56,6 +56,22 @@ class EncodedFrame:
         """Rotation from the camera's optical frame to the level frame."""
         return self.views.R_level_camera
 
+    def pose_of_camera(self, T_level: Transform) -> Transform:
+        """Compute the pose of the camera from the pose of its level frame. Both have their origin at the camera.
+
+        Args:
+            T_level: pose of the level frame, in any frame.
+        """
+        return transform_from(T_level[:3, :3] @ self.R_level_camera, T_level[:3, 3])
+
+    def pose_of_level(self, T_camera: Transform) -> Transform:
+        """Compute the pose of the level frame from the pose of the camera.
+
+        Args:
+            T_camera: pose of the camera, in any frame.
+        """
+        return transform_from(T_camera[:3, :3] @ self.R_level_camera.T, T_camera[:3, 3])
+
     def T_reference_level(self, reference: "EncodedFrame") -> Transform:
         """Compute the pose of this frame's level frame in the level frame of the reference.
 

@@ -62,9 +62,9 @@ def confirm(cloud: Cloud, structure: StructureScorer, pose: Registered) -> Confi
     found = []
     for image, each in zip(structure.images, structure.measured, strict=True):
         own = each.pose(pose)
-        R_map_camera = own.R_map_level @ each.frame.R_level_camera
-        step = ALONG_M * forward(R_map_camera)
-        here, ahead, behind = (rendered(cloud, R_map_camera, own.camera_m + sign * step) for sign in (0, 1, -1))
+        T = each.frame.pose_of_camera(own.T_map_level)
+        step = ALONG_M * forward(T[:3, :3])
+        here, ahead, behind = (rendered(cloud, T[:3, :3], T[:3, 3] + sign * step) for sign in (0, 1, -1))
         found.append(confirmation_of(image, here, (ahead, behind), scale=own.scale, offset=own.offset))
     return Confirmation(*np.mean([astuple(each) for each in found], axis=0).tolist())
 

@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float64
 from numpy.typing import NDArray
 
-from service.geometry.rigid import Transform, transform_from
+from service.geometry.rigid import Transform
 from service.registration.kernel import QueryPoints
 from service.registration.points import DepthBlocks, PointSettings, below, blocks_of, movable_of, points_from
 from service.registration.rays import RayPicture, picture_of
@@ -84,7 +84,7 @@ def measure(
         T_reference_level = frame.T_reference_level(frames[0])
         picture = picture_of(
             blocks,
-            T_reference_level @ transform_from(frame.R_level_camera, np.zeros(3)),
+            frame.pose_of_camera(T_reference_level),
             noise=frame.noise,
             focal_baseline_px_m=focal_baseline_px_m if is_rig else None,
             movable=movable_of(blocks, frame.R_level_camera, frame.views.height_m, settings),

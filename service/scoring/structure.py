@@ -330,6 +330,7 @@ class StructureScorer:
         found = []
         for image, each in zip(self.images, self.measured, strict=True):
             own = each.pose(pose)
-            rendered_m = rendered(self._cloud, own.R_map_level @ each.frame.R_level_camera, own.camera_m)
+            T = each.frame.pose_of_camera(own.T_map_level)
+            rendered_m = rendered(self._cloud, T[:3, :3], T[:3, 3])
             found.append(astuple(compare(image, rendered_m, scale=own.scale, offset=own.offset)))
         return np.asarray(np.mean(found, axis=0), np.float64)

@@ -5,7 +5,6 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from service.geometry.rigid import transform_from
 from service.maps.map import Map
 from service.registration.local_search import LocalPose
 from service.registration.register import Registered
@@ -139,10 +138,9 @@ class PoseScorer:
         for scorer, _ in self.scorers:
             own = scorer.score(found)
             scores |= {name: values.tolist() for name, values in {scorer.name: own.values, **own.details}.items()}
-        R_level_camera = self.measured[0].frame.R_level_camera
         candidates = []
         for k, pose in enumerate(found):
-            T_map_camera = transform_from(pose.R_map_level @ R_level_camera, pose.camera_m)
+            T_map_camera = self.measured[0].frame.pose_of_camera(pose.T_map_level)
             own_scores = {name: values[k] for name, values in scores.items()}
             candidates.append(Candidate(T_map_camera, pose, own_scores, self._support(own_scores)))
         return sorted(candidates, key=lambda candidate: -candidate.support)

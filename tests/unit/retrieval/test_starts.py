@@ -262,3 +262,20 @@ def test_a_point_is_the_same_point_in_the_level_frames_of_both_cameras(
     frame = frame_with(matches, R_level_camera=R_level_camera, T_reference_camera=T_reference_camera)
     T = frame.T_reference_level(reference)
     np.testing.assert_allclose(transform_points(T, in_camera @ R_level_camera.T), through, atol=1e-9)
+
+
+@given(angle, st.floats(-3, 3), st.lists(st.floats(-5, 5), min_size=3, max_size=3))
+def test_the_pose_of_the_level_frame_and_that_of_the_camera_follow_from_each_other(
+    matches_at, frame_with, pitch, turn, position
+):
+    """A point in front of the camera has the same coordinates in the map by both poses."""
+    frame = frame_with(matches_at([(0, 0, 2)], [0], [0.9]), R_level_camera=rotation_y(pitch) @ R_BODY_OPTICAL)
+    T_map_camera = transform_from(rotation_y(turn), np.array(position))
+    T_map_level = frame.pose_of_level(T_map_camera)
+    np.testing.assert_allclose(frame.pose_of_camera(T_map_level), T_map_camera, atol=1e-12)
+    in_camera = np.array([[1.0, 2.0, 3.0]])
+    np.testing.assert_allclose(
+        transform_points(T_map_level, in_camera @ frame.R_level_camera.T),
+        transform_points(T_map_camera, in_camera),
+        atol=1e-9,
+    )
