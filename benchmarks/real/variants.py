@@ -84,6 +84,7 @@ def variant_rows(report: Report, data: Path, work: Path) -> None:
             write_smaller_images(drive, work / f"{DRIVE}_smaller_raw", factor), work / f"{DRIVE}_smaller_data"
         )
         answer_rows(report, f"real.{DRIVE}.smaller_{factor}", predict(whole, smaller, QUERIES), bars=False)
+        prior_rows(report, f"{DRIVE}.smaller_{factor}", smaller, whole)
     for each in SPARSE:
         found = []
         for first in range(each):

@@ -9,11 +9,12 @@ from functools import cached_property
 from typing import Literal
 
 import numpy as np
-from jaxtyping import Float64
+from jaxtyping import Bool, Float64
 from numpy.typing import NDArray
 
 from service.confidence.shape import Shape, shape_of
 from service.errors import BundleError
+from service.geometry.rigid import heading_of_camera
 from service.imaging.view_grid import ViewGrid
 from service.maps.calibration import Calibration
 from service.retrieval.hypotheses import Hypothesis
@@ -28,6 +29,9 @@ _NEAREST = 5  # number of the most similar neighbours in ``pose_spread``
 _MOST_MARGIN = 12.0  # nats; largest margin, also used if there is no rival
 _MOST_PLACE_M = 10.0
 _LONE_ADVANTAGE = 0.3  # a typical value of right answers
+#: A pose whose log weight by the prior is lower than that of the answer by this much is no rival, nats (decision 0135). A prior lowers a
+#: log weight by 5 nats at most, so it excludes rivals only if it agrees with the answer.
+EXCLUDED_NATS = 4.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,16 +76,37 @@ class Evidence:
         xy = self.best.T_map_camera[:2, 3]
         return np.array([np.hypot(*(place.position_m[:2] - xy)) for place in self.neighbours])
 
+    def rivals(
+        self, xy: Float64[NDArray[np.float64], "n 2"], heading_rad: Float64[NDArray[np.float64], " n"]
+    ) -> Bool[NDArray[np.bool_], " n"]:
+        """Return whether the query's prior allows each pose beside the answer (n,). Without a prior all are allowed.
+
+        Args:
+            xy: positions, map frame, metres.
+            heading_rad: headings of the optical axis, counter-clockwise from map x, rad.
+        """
+        prior = self.frames[0].query.prior
+        if prior is None:
+            return np.ones(len(xy), np.bool_)
+        T = self.best.T_map_camera
+        answer = float(prior.log_weight(T[None, :2, 3], np.array([heading_of_camera(T)]))[0])
+        return np.asarray(prior.log_weight(xy, heading_rad) > answer - EXCLUDED_NATS)
+
     @property
     def inlier_advantage(self) -> float:
         """Inliers of the best candidate minus the median of its rivals; ``_LONE_ADVANTAGE`` without rivals."""
-        rivals = [rival.registered.inliers for rival in distinct_candidates(self.refined.candidates)[1:]]
-        return self.best.registered.inliers - float(np.median(rivals)) if rivals else _LONE_ADVANTAGE
+        others = distinct_candidates(self.refined.candidates)[1:]
+        xy = np.array([other.T_map_camera[:2, 3] for other in others]).reshape(-1, 2)
+        rival = self.rivals(xy, np.array([heading_of_camera(other.T_map_camera) for other in others]))
+        inliers = np.array([other.registered.inliers for other in others])[rival]
+        return self.best.registered.inliers - float(np.median(inliers)) if len(inliers) else _LONE_ADVANTAGE
 
     @property
     def similarity_margin(self) -> float:
         """Similarity of the best candidate minus that of the most similar neighbour elsewhere, times the root of the frames."""
-        elsewhere = np.array([place.similarity for place in self.neighbours])[self.away_m > OTHER_PLACE_M]
+        xy = np.array([place.position_m[:2] for place in self.neighbours])
+        rival = self.rivals(xy, np.array([place.heading_rad for place in self.neighbours]))
+        elsewhere = np.array([place.similarity for place in self.neighbours])[rival & (self.away_m > OTHER_PLACE_M)]
         other = float(elsewhere.max()) if len(elsewhere) else 0.5
         return float(np.sqrt(len(self.frames))) * (self.best.scores["similarity"] - other)
 
@@ -97,8 +122,12 @@ class Evidence:
 
     @property
     def entropy(self) -> float:
-        """Entropy of the clusters' weights, nats."""
+        """Entropy of the weights of the clusters that the prior allows, nats; of all clusters if it allows none."""
+        xy = np.array([hypothesis.position_m[:2] for hypothesis in self.hypotheses])
+        rival = self.rivals(xy, np.array([hypothesis.heading_rad for hypothesis in self.hypotheses]))
         weights = np.array([hypothesis.weight for hypothesis in self.hypotheses])
+        if rival.any():
+            weights = weights[rival] / weights[rival].sum()
         return float(-(weights * np.log(np.maximum(weights, 1e-12))).sum())
 
     @property

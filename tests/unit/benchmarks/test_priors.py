@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from benchmarks.priors import PRIORS, STD_M, next_block
+from benchmarks.priors import PRIORS, STD_M, at_a_place, next_block
 from model_training.simulation.repeating import BLOCK_M
 
 
@@ -30,3 +30,11 @@ def test_the_next_block_is_a_block_further():
     position_m = next_block(T, np.random.default_rng(0)).position_m
     assert position_m is not None
     np.testing.assert_allclose(position_m, [BLOCK_M, 0.0])
+
+
+def test_a_robot_outside_of_the_map_claims_to_be_near_one_of_its_places():
+    places = np.array([[100.0, 0.0], [0.0, 100.0]])
+    found = [at_a_place(places)(np.eye(4), np.random.default_rng(k)).position_m for k in range(200)]
+    away = np.array([np.linalg.norm(places - each, axis=1) for each in found])
+    assert away.min(axis=1).max() < 5 * STD_M
+    assert 0.4 < (away[:, 0] < away[:, 1]).mean() < 0.6

@@ -13,6 +13,7 @@ from service.imaging.view_grid import ViewGrid
 from service.maps.calibration import read_calibration
 from service.retrieval.hypotheses import Hypothesis
 from service.retrieval.knn import Neighbour
+from service.retrieval.prior import Prior
 from service.scoring.candidates import Refined
 from service.scoring.confirmation import Confirmation
 
@@ -28,8 +29,8 @@ def neighbour(x, similarity=0.5, *, y=0.0, z=0.0):
     return Neighbour(0, similarity, 0.0, -1, np.array([x, y, z], np.float64), 0.0)
 
 
-def hypothesis(weight):
-    return Hypothesis(weight, np.zeros(3), 0.0, np.array([0.0, 0.0, 1.0]), 0, -1, 0.5, 1)
+def hypothesis(weight, x=0.0):
+    return Hypothesis(weight, np.array([x, 0.0, 0.0]), 0.0, np.array([0.0, 0.0, 1.0]), 0, -1, 0.5, 1)
 
 
 @pytest.fixture(scope="module")
@@ -41,14 +42,14 @@ def frame(frame_with, matches_at):
 def weighed(candidate, frame):
     """Return the features by name. Defaults: one candidate, one neighbour, one hypothesis, one frame."""
 
-    def weigh(*, candidates=None, neighbours=None, weights=(1.0,), frames=None, places=None, **options):
+    def weigh(*, candidates=None, neighbours=None, weights=(1.0,), apart_m=0.0, frames=None, places=None, **options):
         neighbours = neighbours or [neighbour(0)]
         there = np.array(places or [each.position_m[:2] for each in neighbours], np.float64)
         found = evidence_of(
             frames or (frame,),
             refined(*(candidates or [candidate()]), **options),
             tuple(neighbours),
-            tuple(hypothesis(weight) for weight in weights),
+            tuple(hypothesis(weight, apart_m * k) for k, weight in enumerate(weights)),
             there,
             ViewGrid(),
         )
@@ -189,6 +190,63 @@ def test_a_sparse_survey_has_fewer_places_to_vote_but_no_smaller_a_share(weighed
 )
 def test_entropy_measures_over_how_many_clusters_the_weight_is_spread(weighed, weights, entropy):
     assert weighed(weights=weights)["entropy"] == pytest.approx(entropy, abs=1e-9)
+
+
+def with_prior(frame, **prior):
+    return (replace(frame, query=replace(frame.query, prior=Prior(**prior))),)
+
+
+HERE, FAR = (
+    {"position_m": np.zeros(2), "position_std_m": 5.0},
+    {"position_m": np.array([60.0, 0.0]), "position_std_m": 5.0},
+)
+
+
+@pytest.mark.parametrize(
+    ("prior", "similarity_margin", "entropy", "inlier_advantage"),
+    [
+        (HERE, 0.8 - 0.6, 0.0, 0.7 - 0.6),  # the place at 12 m stays a rival, those at 60 m do not
+        (FAR, 0.8 - 0.85, np.log(2), 0.7 - 0.5),  # it contradicts the answer, so it excludes nothing
+        (HERE | {"position_std_m": 100.0}, 0.8 - 0.85, np.log(2), 0.7 - 0.5),  # too wide
+        ({"heading_rad": 0.0}, 0.8 - 0.85, np.log(2), 0.7 - 0.5),  # all headings agree
+        ({"heading_rad": 0.0, **HERE}, 0.8 - 0.6, 0.0, 0.7 - 0.6),
+    ],
+)
+def test_places_that_the_prior_excludes_are_no_rivals(
+    candidate, weighed, frame, prior, similarity_margin, entropy, inlier_advantage
+):
+    """Log weights for a deviation of 5 m, relative to the answer: -2.8 at 12 m (exp(-2.88) plus the constant), -5 at 60 m."""
+
+    def with_inliers(inliers, x):
+        found = candidate(xyz=(x, 0, 1.5))
+        return replace(found, registered=replace(found.registered, inliers=inliers))
+
+    found = weighed(
+        frames=with_prior(frame, **prior),
+        candidates=(with_inliers(0.7, 0), with_inliers(0.6, 12), with_inliers(0.5, 60), with_inliers(0.1, 65)),
+        neighbours=[neighbour(60, 0.85), neighbour(0, 0.8), neighbour(12, 0.6)],
+        weights=(0.5, 0.5),
+        apart_m=60.0,
+    )
+    assert found["similarity_margin"] == pytest.approx(similarity_margin)
+    assert found["entropy"] == pytest.approx(entropy, abs=1e-9)
+    assert found["inlier_advantage"] == pytest.approx(inlier_advantage)
+
+
+def test_a_prior_heading_excludes_the_other_direction(candidate, weighed, frame):
+    """The street in the opposite direction is 9 standard deviations away."""
+    back = candidate(xyz=(0, 0, 1.5), heading_deg=180)
+    both = (candidate(10.0), replace(back, registered=replace(back.registered, inliers=0.2)))
+    assert weighed(candidates=both)["inlier_advantage"] == pytest.approx(0.5)
+    frames = with_prior(frame, heading_rad=0.0)
+    assert weighed(candidates=both, frames=frames)["inlier_advantage"] == 0.3
+
+
+def test_a_prior_that_allows_no_cluster_leaves_their_entropy(candidate, weighed, frame):
+    """The answer lies at the prior, far from all clusters: the search did not find it, registration did."""
+    frames = with_prior(frame, position_m=np.array([200.0, 0.0]), position_std_m=5.0)
+    found = weighed(candidates=(candidate(xyz=(200, 0, 1.5)),), frames=frames, weights=(0.5, 0.5), apart_m=60.0)
+    assert found["entropy"] == pytest.approx(np.log(2))
 
 
 def test_sigma_is_that_of_the_worst_horizontal_direction(weighed):
