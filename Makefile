@@ -35,7 +35,7 @@ export ORT_DISABLE_TELEMETRY := 1
 .DEFAULT_GOAL := help
 .NOTPARALLEL:
 .DELETE_ON_ERROR:
-.PHONY: help demo demo-real test test-service test-ray check check-native sanitize console check-console test-console format generate release-proto lock evaluate evaluate-real bench-kitti choices paper bench-training bench-serving bench-scale fuzz chaos sbom audit reports docs docs-blocks house pictures encoder paper-encoder calibration install-demo install-test clean
+.PHONY: help demo demo-real test test-service test-ray check check-native sanitize console check-console test-console format generate release-proto lock evaluate evaluate-real bench-kitti choices paper bench-training bench-serving bench-scale fuzz chaos sbom audit reports docs docs-blocks same-answers house pictures encoder paper-encoder calibration install-demo install-test clean
 
 help: ## list all targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "make %-16s %s\n", $$1, $$2}' Makefile
@@ -178,6 +178,9 @@ docs: .venv/.torch ## the site of docs/ -> out/site; a broken link fails
 house: .venv/.torch ## how readable code and documents are -> reports/house.json
 	$(INSTALL) 'textstat>=0.7.8,<0.7.9'
 	$(BIN)/python -m benchmarks.house $(ARGS)
+
+same-answers: .venv/.torch ## compare the answers of this commit with those of another: make same-answers BEFORE=COMMIT -> reports/checks
+	$(BIN)/python -m benchmarks.same_answers --before $(BEFORE) $(ARGS)
 
 docs-blocks: .venv/.torch ## run every code block of README and docs that can run here -> reports/console.json
 	$(BIN)/python -m benchmarks.docs_blocks $(ARGS)

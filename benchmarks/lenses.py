@@ -24,7 +24,7 @@ from model_training.simulation.plan import QueryPlan, SimulationPlan
 from model_training.simulation.scene import Scene
 from model_training.simulation.shading import Light
 from model_training.stock import ENCODER
-from model_training.training.recipe import WATCH_SEEDS
+from model_training.training.recipe import VALIDATION_SEEDS
 from service.errors import NoDepthError
 from service.geometry.camera import PinholeCamera
 from service.imaging.rectify import rectification_of, rectified_pair
@@ -67,7 +67,7 @@ def plan_of(count: int) -> SimulationPlan:
         count: number of queries.
     """
     queries = (QueryPlan(name=QUERIES, traversal=1, count=count, depths=("precise",)),)
-    return SimulationPlan(name="lenses", seed=WATCH_SEEDS[50], size_m=(240.0, 160.0), queries=queries)
+    return SimulationPlan(name="lenses", seed=VALIDATION_SEEDS[50], size_m=(240.0, 160.0), queries=queries)
 
 
 class Photographer:

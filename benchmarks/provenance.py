@@ -1,5 +1,6 @@
 """Provenance of a figure: the run that measured it, and whether the measured code has changed since."""
 
+import json
 import os
 import platform
 import subprocess
@@ -156,6 +157,9 @@ NOT_RUN: dict[str, tuple[str, ...]] = {
     )
 }
 
+#: Passed checks that a change left answers equal (``benchmarks.same_answers``).
+CHECKS = ROOT / "reports" / "checks" / "same_answers.json"
+
 
 def measured_paths(report: str, row_id: str) -> tuple[str, ...]:
     """Return the files and folders that a row measures; all code for an unknown report.
@@ -172,8 +176,8 @@ def measured_paths(report: str, row_id: str) -> tuple[str, ...]:
 def mark_stale(report: str, rows: Iterable[dict[str, Any]], runs: Mapping[str, Mapping[str, Any]], head: str) -> None:
     """Mark each row whose measured code differs between its commit and ``head``.
 
-    ``stale`` is true, or "unknown" if Git cannot tell: there is no repository, or it lacks the commit. Current rows
-    have no such field.
+    ``stale`` is true, or "unknown" if Git cannot tell: there is no repository, or it lacks the commit. It is "same answers" if the code
+    changed, but a check compared the answers of both versions (``benchmarks.same_answers``). Current rows have no such field.
 
     Args:
         report: name of the report.
@@ -182,12 +186,41 @@ def mark_stale(report: str, rows: Iterable[dict[str, Any]], runs: Mapping[str, M
         head: commit to compare with.
     """
     for row in rows:
-        changed = _changed_files(runs[row["run"]]["commit"], head)
+        commit = runs[row["run"]]["commit"]
+        changed = _changes_row(report, row["id"], commit, head)
         row.pop("stale", None)
         if changed is None:
             row["stale"] = "unknown"
-        elif _touches(_without(changed, NOT_RUN.get(report, ())), measured_paths(report, row["id"])):
-            row["stale"] = True
+        elif changed:
+            row["stale"] = "same answers" if _is_checked(report, row["id"], commit, head) else True
+
+
+def _changes_row(report: str, row_id: str, commit: str, head: str) -> bool | None:
+    """Return whether code that a row measures differs between two commits; None if Git cannot tell."""
+    changed = _changed_files(commit, head)
+    if changed is None:
+        return None
+    return _touches(_without(changed, NOT_RUN.get(report, ())), measured_paths(report, row_id))
+
+
+def _is_checked(report: str, row_id: str, commit: str, head: str) -> bool:
+    """Return whether checks connect the code of a row with that of ``head``. Each check connects two commits."""
+    reached, checks = (
+        [commit],
+        [each for each in _checks() if row_id.startswith(tuple(each["covered"].get(report, ())))],
+    )
+    for origin in reached:
+        if _changes_row(report, row_id, origin, head) is False:
+            return True
+        for check in checks:
+            if check["after"] not in reached and _changes_row(report, row_id, origin, check["before"]) is False:
+                reached.append(check["after"])
+    return False
+
+
+def _checks() -> list[dict[str, Any]]:
+    kept: list[dict[str, Any]] = json.loads(CHECKS.read_text()) if CHECKS.exists() else []
+    return kept
 
 
 def _touches(changed: Iterable[str], paths: tuple[str, ...]) -> bool:

@@ -23,7 +23,9 @@ HEAD = """# Reports
 `make reports` writes this page from the JSON files beside it. The figures in the tables come from runs; the column *run* names the run
 that measured the row. The reasons below a table are written by people (`benchmarks/why_missed.py`), each for the one value that it names;
 when that value has changed, the page says so instead of the reason. **Stale** means that code that the row measures has changed since the
-row's commit; any change of these files counts, a comment too. *Age unknown* means that Git could not tell.
+row's commit; any change of these files counts, a comment too. *Same answers* means that code changed, but `make same-answers` compared
+both versions: maps and answers of small cities and of drive 0005 were equal to the bit (`checks/same_answers.json`).
+*Age unknown* means that Git could not tell.
 """
 
 
@@ -43,7 +45,9 @@ def _section(name: str, report: dict[str, Any]) -> list[str]:
     """Return one report: its runs, rows, reasons and images."""
     rows, notes = report["rows"], report.get("notes", {})
     numbers = {key: number for number, key in enumerate(report["runs"], 1)}
-    stale, unknown = (sum(row.get("stale") is state for row in rows) for state in (True, "unknown"))
+    stale, same, unknown = (
+        sum(row.get("stale") == state for row in rows) for state in (True, "same answers", "unknown")
+    )
     lines = [
         f"## {name}",
         "",
@@ -55,9 +59,14 @@ def _section(name: str, report: dict[str, Any]) -> list[str]:
         for key, number in numbers.items()
     ]
     lines += [""]
-    if stale or unknown:
+    if stale or same or unknown:
         as_of = f"commit `{report['stale_as_of'][:10]}`" if report["stale_as_of"] else "no commit: there is no Git"
         lines += [f"Of {len(rows)} rows {stale} are stale and {unknown} of unknown age, as of {as_of}.", ""]
+    if same:
+        lines += [
+            f"{same} rows have the same answers although code changed. `make same-answers` compared both versions.",
+            "",
+        ]
     lines += [f"{text}\n" for text in notes.values() if isinstance(text, str)]
     lines += ["| row | value | 95 % interval | n | bar | | run | |", "|---|---|---|---|---|---|---|---|"]
     lines += [_line(row, numbers[row["run"]]) for row in rows]
@@ -171,7 +180,7 @@ def _line(row: dict[str, Any], run: int) -> str:
     interval = "{:.4f} - {:.4f}".format(*row["ci95"]) if "ci95" in row else ""
     bar = _bar(row) if "bar" in row else ""
     mark = "" if "bar" not in row else ("holds" if row["holds"] else "**missed**")
-    age = {True: "**stale**", "unknown": "age unknown", None: ""}[row.get("stale")]
+    age = {True: "**stale**", "same answers": "same answers", "unknown": "age unknown", None: ""}[row.get("stale")]
     return f"| `{row['id']}` | {value} | {interval} | {row.get('n', '')} | {bar} | {mark} | {run} | {age} |"
 
 

@@ -29,8 +29,8 @@ def rig_rows(report: Report, encoder: Path, work: Path) -> None:
         work: folder of the calibration's cities, maps and answers.
     """
     with bars() as progress:
-        asked = collected(work, encoder, report=progress)
-    figures, coverage = cross_check(asked, not_fitted=NOT_FITTED), dict[str, Coverage]()
+        data = collected(work, encoder, report=progress)
+    figures, coverage = cross_check(data, not_fitted=NOT_FITTED), dict[str, Coverage]()
     for each in figures:
         row, inside, every = f"rigs.{each.family}", each.inside, each.inside + each.outside
         report.row(f"{row}.ece", each.ece, "share", bar=_ECE, better="lower", n=every)
@@ -43,7 +43,7 @@ def rig_rows(report: Report, encoder: Path, work: Path) -> None:
         )
         if each.outside:
             report.row(f"{row}.outside_accepted", each.outside_accepted, "share", better="lower", n=each.outside)
-        own = asked.where(asked.family == each.family)
+        own = data.where(data.family == each.family)
         found = coverage_rows(report, row, own.error, own.covariance, own.heading_rad)
         if found is not None and each.family != _REPEATING:
             coverage[each.family] = found

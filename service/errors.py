@@ -41,6 +41,7 @@ This module defines no status code of HTTP or gRPC. Each interface has one table
 500 or INTERNAL and the request id, and log the traceback.
 """
 
+from pathlib import Path
 from typing import Any, ClassVar, Literal
 
 Kind = Literal[
@@ -206,6 +207,16 @@ class BundleError(StreetfixError):
 
     code = "bundle"
     kind = "not_ready"
+
+
+def damaged_file(path: Path, what: str) -> BundleError:
+    """Return the error for a damaged file of a map bundle.
+
+    Args:
+        path: the file.
+        what: what is wrong.
+    """
+    return BundleError(f"{path}: {what}; copy or build the bundle again", field=path.name)
 
 
 class SearchError(StreetfixError):

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from benchmarks.choices.registration import registration_rows
 from benchmarks.choices.trainings import VARIATIONS, trained
-from benchmarks.choices.watch import Seen, WatchCity, watch_plan
+from benchmarks.choices.validation_city import Seen, ValidationCity, validation_plan
 from benchmarks.report import ROOT, Report
 from benchmarks.runs import Runs
 from model_training.cli.progress import bars
@@ -30,7 +30,7 @@ KS = (1, 3, 5, 9, 15, 21)
 FANS = (24, 12, 8, 4, 2)
 
 
-def encoder_rows(report: Report, city: WatchCity, seen: dict[str, Seen]) -> None:
+def encoder_rows(report: Report, city: ValidationCity, seen: dict[str, Seen]) -> None:
     """Add R@1 and R@10 of every variation.
 
     Args:
@@ -45,7 +45,7 @@ def encoder_rows(report: Report, city: WatchCity, seen: dict[str, Seen]) -> None
             report.share(f"choices.{name}.{preset}.recall_at_10_5m", city.right(queries, likeness, first=10))
 
 
-def fan_rows(report: Report, city: WatchCity, stock: Seen) -> None:
+def fan_rows(report: Report, city: ValidationCity, stock: Seen) -> None:
     """Add rows for fewer views per place, counted from the principal heading (PCA) or from the map's x axis.
 
     Args:
@@ -77,7 +77,7 @@ def _nearest_to_fixed(headings_rad: NDArray[np.float64], count: int) -> NDArray[
     return allowed
 
 
-def neighbour_rows(report: Report, city: WatchCity, stock: Seen) -> None:
+def neighbour_rows(report: Report, city: ValidationCity, stock: Seen) -> None:
     """Add street accuracy by the vote of the k most similar places, weighted by similarity as in the service.
 
     Args:
@@ -126,8 +126,8 @@ def main() -> None:
         files = {name: trained(name, arguments.work, arguments.steps, show) for name in names}
     if arguments.train:
         return
-    dataset = runs.dataset(watch_plan())
-    city = WatchCity(dataset, ViewGrid())
+    dataset = runs.dataset(validation_plan())
+    city = ValidationCity(dataset, ViewGrid())
     encoders = {name: (Encoder.open(file), VARIATIONS[name].blind) for name, file in files.items()}
     with bars() as show:
         seen = city.seen_by(encoders | {"stock": (Encoder.open(ENCODER), ())}, show)
@@ -136,7 +136,7 @@ def main() -> None:
     neighbour_rows(report, city, seen["stock"])
     registration_rows(report, runs, dataset)
     report.notes["trainings"] = (
-        f"{arguments.steps} steps of 128 pairs each, in half precision where the processor has it, one round; the watch city's "
+        f"{arguments.steps} steps of 128 pairs each, in half precision where the processor has it, one round; the validation city's "
         f"{len(city.kept)} places with {city.settings.headings} views; `stock` is the shipped encoder."
     )
     print(f"written: {report.write()}")

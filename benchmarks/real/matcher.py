@@ -16,7 +16,7 @@ from model_training.evaluation.disparity_errors import DisparityErrors, disparit
 from model_training.simulation.plan import QueryPlan, SimulationPlan
 from model_training.simulation.sensor_parameters import RgbParameters
 from model_training.simulation.simulate import simulate
-from model_training.training.recipe import WATCH_SEEDS
+from model_training.training.recipe import VALIDATION_SEEDS
 
 DRIVES, FRAMES, FIRST_SEED = 6, 6, 20
 #: A machine-vision camera that is exposed for the shade, so that sunlit roads clip, as 0005's are.
@@ -48,7 +48,7 @@ def simulated_errors(work: Path) -> DisparityErrors:
         )
         plan = SimulationPlan(
             name=f"matcher-{k}",
-            seed=WATCH_SEEDS[FIRST_SEED + k],
+            seed=VALIDATION_SEEDS[FIRST_SEED + k],
             size_m=(120.0, 120.0),
             lidar=rig.lidar,
             lidar_height_m=rig.lidar_height_m,

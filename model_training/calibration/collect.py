@@ -8,10 +8,10 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from model_training.calibration.fit import Asked
+from model_training.calibration.fit import CalibrationData
+from model_training.calibration.out_of_map import KINDS, out_of_map_queries
 from model_training.calibration.plans import SEQUENCE
 from model_training.calibration.rigs import Rig
-from model_training.calibration.strangers import KINDS, strangers
 from model_training.datasets.dataset import Dataset
 from model_training.evaluation.pose_errors import pose_errors
 from model_training.evaluation.predict import Predictions, predict
@@ -30,7 +30,7 @@ Report = Callable[[str, int, int], None]
 
 def in_the_map(
     localizer: Localizer, dataset: Dataset, report: Report, names: Sequence[str] = (), *, rig: Rig | None = None
-) -> list[Asked]:
+) -> list[CalibrationData]:
     """Localize query sets of the map's own city.
 
     Args:
@@ -41,14 +41,14 @@ def in_the_map(
         rig: rig of the queries; None for the dataset's own camera.
     """
     return [
-        asked_of(_predicted(localizer, dataset, name, report, rig), _by(rig, name), known=True)
+        calibration_data_of(_predicted(localizer, dataset, name, report, rig), _by(rig, name), known=True)
         for name in names or dataset.query_sets(with_truth=True)
     ]
 
 
 def of_another_city(
     localizer: Localizer, dataset: Dataset, report: Report, names: Sequence[str] = (), *, rig: Rig | None = None
-) -> list[Asked]:
+) -> list[CalibrationData]:
     """Localize query sets of a city that the map does not cover: out-of-map queries.
 
     Args:
@@ -59,7 +59,7 @@ def of_another_city(
         rig: rig of the queries; None for the dataset's own camera.
     """
     return [
-        asked_of(
+        calibration_data_of(
             _predicted(localizer, dataset, name, report, rig), _by(rig, f"other_city.{preset_of(name)}"), known=False
         )
         for name in names or dataset.query_sets(with_truth=True)
@@ -72,7 +72,7 @@ def where_streets_are_missing(
     names: list[str],
     is_outside: Callable[[np.ndarray], np.ndarray],
     report: Report,
-) -> list[Asked]:
+) -> list[CalibrationData]:
     """Localize query sets in a map of their city without some streets.
 
     Args:
@@ -89,8 +89,8 @@ def where_streets_are_missing(
     for name in names:
         predictions = predict(localizer, dataset, name, report=report)
         outside = is_outside(predictions.T_true[:, :2, 3])
-        both = asked_of(predictions, name, known=True)
-        found.append(asked_of(predictions, f"removed_streets.{preset_of(name)}", known=False).where(outside))
+        both = calibration_data_of(predictions, name, known=True)
+        found.append(calibration_data_of(predictions, f"removed_streets.{preset_of(name)}", known=False).where(outside))
         found.append(both.where(~outside))
     return found
 
@@ -104,7 +104,7 @@ def walls_and_rooms(
     *,
     count: int = 100,
     rig: Rig | None = None,
-) -> list[Asked]:
+) -> list[CalibrationData]:
     """Localize simulated walls and rooms, which no map contains.
 
     Args:
@@ -121,11 +121,11 @@ def walls_and_rooms(
         for order, model in enumerate(models):
             rng = np.random.default_rng([seed, number, order])
             evidence = np.full((count, len(FEATURES)), np.nan)
-            for k, query in enumerate(strangers(kind, camera, model, count, rng)):
+            for k, query in enumerate(out_of_map_queries(kind, camera, model, count, rng)):
                 evidence[k] = _evidence(localizer, query if rig is None else rig.seen(query))
-                report(_by(rig, f"strangers {kind}_{model.name}"), k + 1, count)
+                report(_by(rig, f"walls and rooms {kind}_{model.name}"), k + 1, count)
             found.append(
-                Asked(
+                CalibrationData(
                     evidence=evidence,
                     right=np.zeros(count, bool),
                     known=np.zeros(count, bool),
@@ -172,7 +172,7 @@ def preset_of(query_set: str) -> str:
     return re.split(r"[._]", query_set)[-1]
 
 
-def asked_of(predictions: Predictions, kind: str, *, known: bool) -> Asked:
+def calibration_data_of(predictions: Predictions, kind: str, *, known: bool) -> CalibrationData:
     """Return the rows of the calibration data for the predictions of a query set.
 
     The answer to an out-of-map query always counts as wrong, even if its position is close by accident.
@@ -185,7 +185,7 @@ def asked_of(predictions: Predictions, kind: str, *, known: bool) -> Asked:
     distance = np.linalg.norm(predictions.T_answer[:, :2, 3] - predictions.T_true[:, :2, 3], axis=1)
     right = (np.nan_to_num(distance, nan=np.inf) <= RIGHT_M) & known
     count = len(right)
-    return Asked(
+    return CalibrationData(
         evidence=predictions.evidence,
         right=right,
         known=np.full(count, known),

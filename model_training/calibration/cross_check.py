@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from model_training.calibration.fit import Asked, confidences, expected_calibration_error, fit
+from model_training.calibration.fit import CalibrationData, confidences, expected_calibration_error, fit
 from service.confidence.decision import is_acceptable
 from service.maps.calibration import Calibration
 from service.option_limits import FALSE_ACCEPT_RATE
@@ -40,28 +40,28 @@ class FamilyFigures:
 
 
 def cross_check(
-    asked: Asked, *, not_fitted: Sequence[str] = (), false_accept_rate: float = FALSE_ACCEPT_RATE
+    data: CalibrationData, *, not_fitted: Sequence[str] = (), false_accept_rate: float = FALSE_ACCEPT_RATE
 ) -> list[FamilyFigures]:
     """Predict each rig family from the others.
 
     Args:
-        asked: calibration data of all families.
+        data: calibration data of all families.
         not_fitted: names of the families that take part in no fit.
         false_accept_rate: the rate whose threshold decides the status.
 
     Raises:
         DatasetError: the other families lack right answers, wrong answers, queries in the map or out-of-map queries.
     """
-    usable = ~np.isin(asked.family, not_fitted)
+    usable = ~np.isin(data.family, not_fitted)
     found = []
-    for family in np.unique(asked.family):
-        own = asked.family == family
-        calibration = fit(asked.where(usable & ~own), measured_on={})
-        found.append(figures_of(str(family), asked.where(own), calibration, false_accept_rate))
+    for family in np.unique(data.family):
+        own = data.family == family
+        calibration = fit(data.where(usable & ~own), measured_on={})
+        found.append(figures_of(str(family), data.where(own), calibration, false_accept_rate))
     return found
 
 
-def figures_of(name: str, own: Asked, calibration: Calibration, false_accept_rate: float) -> FamilyFigures:
+def figures_of(name: str, own: CalibrationData, calibration: Calibration, false_accept_rate: float) -> FamilyFigures:
     """Return the figures of some queries.
 
     Args:
@@ -87,19 +87,19 @@ def figures_of(name: str, own: Asked, calibration: Calibration, false_accept_rat
 
 
 def accepted(
-    asked: Asked, calibration: Calibration, confidence: NDArray[np.float64], false_accept_rate: float
+    data: CalibrationData, calibration: Calibration, confidence: NDArray[np.float64], false_accept_rate: float
 ) -> NDArray[np.bool_]:
     """Return whether each answer is LOCALIZED (n,), by the rules of ``service.confidence.decision.decide``.
 
     Args:
-        asked: calibration data.
+        data: calibration data.
         calibration: calibration of the map.
         confidence: confidence of each query (n,).
         false_accept_rate: the rate whose threshold decides.
     """
     found = confidence >= calibration.threshold(false_accept_rate)
     for k in np.flatnonzero(found):
-        found[k] = is_acceptable(calibration, asked.evidence[k], false_accept_rate)
+        found[k] = is_acceptable(calibration, data.evidence[k], false_accept_rate)
     return found
 
 

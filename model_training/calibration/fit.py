@@ -25,7 +25,7 @@ RIDGE, SMOOTH = 3.0, 3.0
 
 
 @dataclass(frozen=True)
-class Asked:
+class CalibrationData:
     """Calibration data: the confidence features of localized queries and their labels.
 
     Attributes:
@@ -51,19 +51,19 @@ class Asked:
     def __len__(self) -> int:
         return len(self.right)
 
-    def registered(self) -> "Asked":
+    def registered(self) -> "CalibrationData":
         """Return the queries with confidence features. The confidence of the others is always 0."""
         return self.where(np.asarray(np.isfinite(self.evidence).all(axis=1)))
 
-    def where(self, keep: NDArray[np.bool_]) -> "Asked":
+    def where(self, keep: NDArray[np.bool_]) -> "CalibrationData":
         """Return some of the queries.
 
         Args:
             keep: whether to keep each query (n,).
         """
-        return Asked(*(getattr(self, name)[keep] for name in Asked.__dataclass_fields__))
+        return CalibrationData(*(getattr(self, name)[keep] for name in CalibrationData.__dataclass_fields__))
 
-    def of_family(self, name: str) -> "Asked":
+    def of_family(self, name: str) -> "CalibrationData":
         """Return the same queries as those of a rig family.
 
         Args:
@@ -72,17 +72,19 @@ class Asked:
         return replace(self, family=np.full(len(self), name))
 
 
-def pooled(parts: list[Asked]) -> Asked:
+def pooled(parts: list[CalibrationData]) -> CalibrationData:
     """Join calibration data.
 
     Args:
         parts: the data to join.
     """
-    return Asked(*(np.concatenate([getattr(part, name) for part in parts]) for name in Asked.__dataclass_fields__))
+    return CalibrationData(
+        *(np.concatenate([getattr(part, name) for part in parts]) for name in CalibrationData.__dataclass_fields__)
+    )
 
 
 def fit(
-    asked: Asked,
+    data: CalibrationData,
     *,
     measured_on: dict[str, str | float],
     features: tuple[Feature, ...] = TABLE,
@@ -95,7 +97,7 @@ def fit(
     out-of-map queries have the same total weight.
 
     Args:
-        asked: the calibration data.
+        data: the calibration data.
         measured_on: description of the data for the calibration file; ``calibration_for`` compares its ``encoder_sha256``.
         features: the features that the models may use, each with its sign.
         ridge: strength of the penalty on the contributions, in queries.
@@ -104,7 +106,7 @@ def fit(
     Raises:
         DatasetError: the data lack right answers, wrong answers, queries in the map or out-of-map queries.
     """
-    used = asked.registered()
+    used = data.registered()
     if used.known.all() or not used.known.any() or used.right.all() or not used.right.any():
         raise DatasetError(
             "calibration needs right and wrong answers, and queries in the map and outside it; send "
@@ -119,64 +121,64 @@ def fit(
         ),
         right=fit_additive(used.evidence, used.right, weights_of(used), weighted, penalty),
         known=fit_additive(used.evidence, used.known, weights_of(used), alone, penalty),
-        thresholds=thresholds_of(asked, held_out_confidences(asked, weighted, penalty)),
-        measured_on=measured_on | {"queries": len(asked)},
+        thresholds=thresholds_of(data, held_out_confidences(data, weighted, penalty)),
+        measured_on=measured_on | {"queries": len(data)},
     )
 
 
-def held_out_confidences(asked: Asked, features: Sequence[Feature], penalty: Penalty) -> NDArray[np.float64]:
+def held_out_confidences(data: CalibrationData, features: Sequence[Feature], penalty: Penalty) -> NDArray[np.float64]:
     """Compute the confidence of every row (n,) by a model that was fitted to other rig families; 0 without registration.
 
     A bound on the false-accept rate needs queries that the model has not seen. With a single family, the model has not seen the row.
 
     Args:
-        asked: the calibration data.
+        data: the calibration data.
         features: the features that the model may use.
         penalty: penalties on the terms.
     """
-    families, number = np.unique(asked.family, return_inverse=True)
-    fold = (number if len(families) > 1 else np.arange(len(asked))) % FOLDS
-    has = np.isfinite(asked.evidence).all(axis=1)
-    found = np.zeros(len(asked))
+    families, number = np.unique(data.family, return_inverse=True)
+    fold = (number if len(families) > 1 else np.arange(len(data))) % FOLDS
+    has = np.isfinite(data.evidence).all(axis=1)
+    found = np.zeros(len(data))
     for k in np.unique(fold):
-        own, others = has & (fold == k), asked.where(has & (fold != k))
+        own, others = has & (fold == k), data.where(has & (fold != k))
         if own.any():
             model = fit_additive(others.evidence, others.right, weights_of(others), features, penalty)
-            found[own] = probability(model.log_odds(asked.evidence[own], FEATURES))
+            found[own] = probability(model.log_odds(data.evidence[own], FEATURES))
     return found
 
 
-def confidences(calibration: Calibration, asked: Asked) -> NDArray[np.float64]:
+def confidences(calibration: Calibration, data: CalibrationData) -> NDArray[np.float64]:
     """Compute the confidence of every row (n,); 0 without registration.
 
     Args:
         calibration: the calibration.
-        asked: the data.
+        data: the data.
     """
-    found = np.zeros(len(asked))
-    has = np.isfinite(asked.evidence).all(axis=1)
-    found[has] = calibration.confidence(asked.evidence[has])
+    found = np.zeros(len(data))
+    has = np.isfinite(data.evidence).all(axis=1)
+    found[has] = calibration.confidence(data.evidence[has])
     return found
 
 
-def weights_of(asked: Asked) -> NDArray[np.float64]:
+def weights_of(data: CalibrationData) -> NDArray[np.float64]:
     """Return the weight of each query (n,), with a mean of 1.
 
     All families have equal weight. In each family, in-map and out-of-map queries have equal weight.
 
     Args:
-        asked: the calibration data.
+        data: the calibration data.
     """
-    weight = np.zeros(len(asked))
-    for family in np.unique(asked.family):
+    weight = np.zeros(len(data))
+    for family in np.unique(data.family):
         for known in (True, False):
-            rows = (asked.family == family) & (asked.known == known)
+            rows = (data.family == family) & (data.known == known)
             if rows.any():
                 weight[rows] = 1.0 / rows.sum()
-    return np.asarray(weight * (len(asked) / weight.sum()))
+    return np.asarray(weight * (len(data) / weight.sum()))
 
 
-def thresholds_of(asked: Asked, confidence: NDArray[np.float64]) -> tuple[Threshold, ...]:
+def thresholds_of(data: CalibrationData, confidence: NDArray[np.float64]) -> tuple[Threshold, ...]:
     """Return for each rate the least confidence at which the false-accept rate is at most this, with certainty ``bounds.SURE``.
 
     The bound of Clopper and Pearson (Biometrika 1934) covers the finite number of out-of-map queries. Another city, removed streets,
@@ -185,14 +187,14 @@ def thresholds_of(asked: Asked, confidence: NDArray[np.float64]) -> tuple[Thresh
     ``SAFE_CONFIDENCE``.
 
     Args:
-        asked: the calibration data.
+        data: the calibration data.
         confidence: confidence of each query (n,).
 
     Raises:
         DatasetError: the data support none of the rates.
     """
-    outside = ~asked.known
-    kinds = np.array([out_of_map_kind(str(kind)) for kind in asked.kind[outside]])
+    outside = ~data.known
+    kinds = np.array([out_of_map_kind(str(kind)) for kind in data.kind[outside]])
     _, number, counts = np.unique(kinds, return_inverse=True, return_counts=True)
     weight = 1.0 / (len(counts) * counts[number])
     effective = 1.0 / float((weight**2).sum())

@@ -9,7 +9,7 @@ import numpy as np
 from model_training.calibration.collect import in_the_map, of_another_city, walls_and_rooms, where_streets_are_missing
 from model_training.calibration.cross_check import cross_check, table
 from model_training.calibration.families import FAMILIES, FAMILY_CITIES, NOT_FITTED, Family, family_plan
-from model_training.calibration.fit import Asked, fit, pooled
+from model_training.calibration.fit import CalibrationData, fit, pooled
 from model_training.calibration.plans import BOTH, CITIES, calibration_plan, repeating_plan
 from model_training.calibration.rigs import RIGS, Rig
 from model_training.datasets.dataset import Dataset
@@ -50,7 +50,7 @@ def calibrate(
         The calibration, and lines of text on how well each rig family is predicted from the others.
     """
     sha256 = Encoder.open(encoder).sha256  # refuse a bad encoder before the work
-    asked = collected(work, encoder, anew=anew, report=report)
+    data = collected(work, encoder, anew=anew, report=report)
     seeds = [calibration_plan(index).seed for index in range(CITIES)]
     measured_on: dict[str, str | float] = {
         "cities": ", ".join(f"seed {seed}" for seed in seeds)
@@ -63,11 +63,11 @@ def calibrate(
         ),
         "encoder_sha256": sha256,
     }
-    fitted = asked.where(~np.isin(asked.family, NOT_FITTED))
-    return fit(fitted, measured_on=measured_on), table(cross_check(asked, not_fitted=NOT_FITTED))
+    fitted = data.where(~np.isin(data.family, NOT_FITTED))
+    return fit(fitted, measured_on=measured_on), table(cross_check(data, not_fitted=NOT_FITTED))
 
 
-def collected(work: Path, encoder: Path, *, anew: bool = False, report: Report = lambda *_: None) -> Asked:
+def collected(work: Path, encoder: Path, *, anew: bool = False, report: Report = lambda *_: None) -> CalibrationData:
     """Simulate the calibration cities, build their maps and localize their queries, or read what an earlier run stored.
 
     Args:
@@ -79,9 +79,9 @@ def collected(work: Path, encoder: Path, *, anew: bool = False, report: Report =
     Raises:
         EncoderError: the encoder cannot be used.
     """
-    families = [_asked_family(work, encoder, family, anew=anew, report=report) for family in FAMILIES]
-    parts = [_asked(work, encoder, k, anew=anew, report=report) for k in range(CITIES)]
-    alike = _asked_repeating(work, encoder, anew=anew, report=report)
+    families = [_data_of_family(work, encoder, family, anew=anew, report=report) for family in FAMILIES]
+    parts = [_data_of_city(work, encoder, k, anew=anew, report=report) for k in range(CITIES)]
+    alike = _data_of_repeating(work, encoder, anew=anew, report=report)
     return pooled([*parts, *families, alike])
 
 
@@ -99,7 +99,7 @@ def _localizer(work: Path, encoder: Path, dataset: Dataset, name: str, report: R
     return Localizer.open(MapBundle.open(folder))
 
 
-def _asked(work: Path, encoder: Path, index: int, *, anew: bool, report: Report) -> Asked:
+def _data_of_city(work: Path, encoder: Path, index: int, *, anew: bool, report: Report) -> CalibrationData:
     """Return the calibration data of one city.
 
     Its queries are localized in its own map, in the map of the other city, and in its own map without a third of the streets. Walls and
@@ -108,11 +108,11 @@ def _asked(work: Path, encoder: Path, index: int, *, anew: bool, report: Report)
     return _kept(work, encoder, calibration_plan(index), lambda: _ask(work, encoder, index, report), anew=anew)
 
 
-def _asked_family(work: Path, encoder: Path, family: Family, *, anew: bool, report: Report) -> Asked:
+def _data_of_family(work: Path, encoder: Path, family: Family, *, anew: bool, report: Report) -> CalibrationData:
     """Return the calibration data of a rig family: queries of its cities in their own and each other's maps, and walls and rooms."""
     plans = [family_plan(family, index) for index in range(FAMILY_CITIES)]
 
-    def ask() -> list[Asked]:
+    def ask() -> list[CalibrationData]:
         cities = [_city(work, plan, report) for plan in plans]
         found = []
         of_rig = Rig(family.name, beams_deg=family.beams, cameras=family.cameras)
@@ -130,11 +130,11 @@ def _asked_family(work: Path, encoder: Path, family: Family, *, anew: bool, repo
     return _kept(work, encoder, plans[0], ask, anew=anew)
 
 
-def _asked_repeating(work: Path, encoder: Path, *, anew: bool, report: Report) -> Asked:
+def _data_of_repeating(work: Path, encoder: Path, *, anew: bool, report: Report) -> CalibrationData:
     """Return the calibration data of a street with repeating blocks, where wrong places look right: single queries and sequences."""
     plan = repeating_plan()
 
-    def ask() -> list[Asked]:
+    def ask() -> list[CalibrationData]:
         street = _city(work, plan, report)
         found = in_the_map(_localizer(work, encoder, street, street.name, report), street, report)
         return [each.of_family("repeating") for each in found]
@@ -142,7 +142,9 @@ def _asked_repeating(work: Path, encoder: Path, *, anew: bool, report: Report) -
     return _kept(work, encoder, plan, ask, anew=anew)
 
 
-def _kept(work: Path, encoder: Path, plan: SimulationPlan, ask: Callable[[], list[Asked]], *, anew: bool) -> Asked:
+def _kept(
+    work: Path, encoder: Path, plan: SimulationPlan, ask: Callable[[], list[CalibrationData]], *, anew: bool
+) -> CalibrationData:
     """Return the calibration data that an earlier run stored under the name of a plan, or compute and store them.
 
     Stored data need no city and no map. So the fit can be repeated where only the answers are.
@@ -150,18 +152,18 @@ def _kept(work: Path, encoder: Path, plan: SimulationPlan, ask: Callable[[], lis
     kept = work / f"asked-{plan.name}-{Encoder.open(encoder).sha256[:12]}.npz"
     if not kept.exists() or anew:
         work.mkdir(parents=True, exist_ok=True)
-        asked, part = pooled(ask()), kept.with_suffix(".part.npz")
-        np.savez_compressed(part, **{name: getattr(asked, name) for name in Asked.__dataclass_fields__})
+        data, part = pooled(ask()), kept.with_suffix(".part.npz")
+        np.savez_compressed(part, **{name: getattr(data, name) for name in CalibrationData.__dataclass_fields__})
         part.rename(kept)
 
-    def read() -> Asked:
+    def read() -> CalibrationData:
         with kept.open("rb") as file, np.load(file, allow_pickle=False) as arrays:
-            return Asked(*(arrays[name] for name in Asked.__dataclass_fields__))
+            return CalibrationData(*(arrays[name] for name in CalibrationData.__dataclass_fields__))
 
     return read_arrays(kept, read, remedy="remove it, and the command sends its queries again")
 
 
-def _ask(work: Path, encoder: Path, index: int, report: Report) -> list[Asked]:
+def _ask(work: Path, encoder: Path, index: int, report: Report) -> list[CalibrationData]:
     cities = [_city(work, calibration_plan(k), report) for k in range(CITIES)]
     own, other = cities[index], cities[(index + 1) % len(cities)]
     partial = WithoutStreets(own.folder)

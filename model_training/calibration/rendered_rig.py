@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from model_training.calibration.elsewhere import without_surroundings
+from model_training.calibration.out_of_map import Box
 from model_training.calibration.own_rig import LabelledFrames, blocks_of, frames_of, joined_frames
-from model_training.calibration.strangers import Box
 from model_training.datasets.files import read_bytes
 from model_training.evaluation.predict import in_order
 from model_training.mapping.rendered_query import grey_image, noisy_depth

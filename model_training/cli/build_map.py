@@ -19,6 +19,8 @@ from model_training.mapping.tiles import require_tile_edge
 from model_training.stock import CALIBRATION, ENCODER
 from service.retrieval.encoder import Encoder
 
+_DEFAULT = BuildSettings(name="default")
+
 
 def command(
     dataset: Annotated[
@@ -37,7 +39,7 @@ def command(
         typer.Option(
             help="Travelled distance between the scans that become places, metres. 0 takes every scan.", min=0
         ),
-    ] = 1.0,
+    ] = _DEFAULT.spacing_m,
     between: Annotated[
         float,
         typer.Option(
@@ -45,14 +47,16 @@ def command(
             "from both scans. 0 puts none there.",
             min=0,
         ),
-    ] = 3.0,
+    ] = _DEFAULT.between_m,
     headings: Annotated[
         int, typer.Option(help="Map views of each place. The stock encoder was trained for 24.", min=1, max=360)
-    ] = 24,
-    voxel: Annotated[float, typer.Option(help="Edge length of the cloud's voxels, metres.", min=0.01)] = 0.3,
+    ] = _DEFAULT.headings,
+    voxel: Annotated[
+        float, typer.Option(help="Edge length of the cloud's voxels, metres.", min=0.01)
+    ] = _DEFAULT.voxel_m,
     lidar_height: Annotated[
         float, typer.Option(help="Approximate height of the LiDAR above the ground, metres.", min=0.1)
-    ] = 1.8,
+    ] = _DEFAULT.expected_lidar_height_m,
     remove_weather: Annotated[
         bool, typer.Option(help="Drop isolated points such as rain and snow by local PCA.")
     ] = False,

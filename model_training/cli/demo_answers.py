@@ -14,7 +14,7 @@ from typing import Any
 from rich.console import Console
 from rich.table import Table
 
-from model_training.cli.demo_map import Question
+from model_training.cli.demo_map import DemoQuery
 from service.cli.send import localize
 from service.errors import RefusedError
 from service.geometry.rigid import heading_of_camera, wrap_angle
@@ -32,7 +32,7 @@ class Outcome:
         elapsed_s: time of the request over HTTP, seconds.
     """
 
-    question: Question
+    question: DemoQuery
     answer: dict[str, Any] | None
     problem: str
     elapsed_s: float
@@ -89,7 +89,7 @@ class Outcome:
         return self.question.place is not None and not self.right
 
 
-def ask(question: Question, url: str) -> Outcome:
+def ask(question: DemoQuery, url: str) -> Outcome:
     """Send an image pair, as ``streetfix localize`` does.
 
     Args:

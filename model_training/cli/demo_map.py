@@ -23,7 +23,7 @@ from service.maps.writer import sha256_of
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Question:
+class DemoQuery:
     """An image pair with its ground truth, which is not sent.
 
     Attributes:
@@ -58,7 +58,7 @@ class DemoMap:
 
     folder: Path
     bundle: Path
-    questions: tuple[Question, ...]
+    questions: tuple[DemoQuery, ...]
     place_names: tuple[str, ...] = ()
 
 
@@ -175,7 +175,7 @@ def _is_noted(note: Path, wanted: dict[str, Any], bundle: Path) -> bool:
         return False
 
 
-def _city_questions(dataset: Dataset, streets: Streets, folder: Path) -> Iterator[Question]:
+def _city_questions(dataset: Dataset, streets: Streets, folder: Path) -> Iterator[DemoQuery]:
     for name in dataset.query_sets():
         for frame in dataset.queries(name):
             if frame.T_map_camera is None:
@@ -185,7 +185,7 @@ def _city_questions(dataset: Dataset, streets: Streets, folder: Path) -> Iterato
             yield _question(f"{frame.number + 1}", frame, folder, street=street)
 
 
-def _recorded_questions(dataset: Dataset, folder: Path) -> Iterator[Question]:
+def _recorded_questions(dataset: Dataset, folder: Path) -> Iterator[DemoQuery]:
     places: list[str] = dataset.description.source["places"]
     for set_name, names in dataset.description.source["queries"].items():
         for frame in dataset.queries(set_name):
@@ -195,9 +195,9 @@ def _recorded_questions(dataset: Dataset, folder: Path) -> Iterator[Question]:
 
 def _question(
     name: str, frame: QueryFrame, folder: Path, *, street: tuple[str, str] | None = None, place: int | None = None
-) -> Question:
+) -> DemoQuery:
     camera = _camera_file(folder, frame)
-    return Question(name, frame.rgb_path, frame.depth_path, camera, frame.T_map_camera, street, place)
+    return DemoQuery(name, frame.rgb_path, frame.depth_path, camera, frame.T_map_camera, street, place)
 
 
 def _camera_file(folder: Path, frame: QueryFrame) -> Path:

@@ -7,11 +7,11 @@ import shutil
 from collections.abc import Sequence
 from pathlib import Path
 
-from model_training.cli.demo_map import Question
+from model_training.cli.demo_map import DemoQuery
 from service.geometry.rigid import heading_of_camera
 
 
-def write_samples(questions: Sequence[Question], folder: Path, *, map_name: str) -> Path:
+def write_samples(questions: Sequence[DemoQuery], folder: Path, *, map_name: str) -> Path:
     """Write images, request and ground truth of each question into its own folder, and return the folder of all.
 
     The folder is written again each time and gets its name when it is complete. A service that starts meanwhile sees the old
@@ -35,7 +35,7 @@ def write_samples(questions: Sequence[Question], folder: Path, *, map_name: str)
     return folder
 
 
-def _write_sample(question: Question, folder: Path, map_name: str) -> None:
+def _write_sample(question: DemoQuery, folder: Path, map_name: str) -> None:
     folder.mkdir(parents=True)
     for source, name in ((question.rgb, "rgb"), (question.depth, "depth")):
         _link(source, folder / f"{name}{source.suffix}")

@@ -17,6 +17,7 @@ from model_training.importing.take import TakeSettings, TakeSummary, take
 from model_training.importing.trajectory import Sync, Trajectory
 from model_training.odometry.align_poses import ALIGNED_KINDS, usual_poses
 from service.errors import DatasetError
+from service.imaging.pca import USUAL_LIDAR_HEIGHT_M
 
 #: Frames without poses, each a place of its own, are imported another way than drives.
 SINGLE_FRAMES = "kitti-object"
@@ -97,7 +98,7 @@ def command(
     ] = True,
     lidar_height: Annotated[
         float, typer.Option(help="With --odometry: approximate height of the LiDAR above the ground, metres.", min=0.1)
-    ] = 1.8,
+    ] = USUAL_LIDAR_HEIGHT_M,
     rectified: Annotated[
         bool | None,
         typer.Option(help="The images of a bag are rectified already.  [default: if the topic's name says so]"),

@@ -57,7 +57,7 @@ def measure(predictions: Predictions, street_names: list[str]) -> dict[str, Any]
     shares: dict[str, NDArray[np.bool_]] = {
         "within_0_5_m": shown <= 0.5,
         "within_1_m": shown <= 1.0,
-        "within_5_m": shown <= 5.0,
+        "within_5_m": shown <= RIGHT_PLACE_M,
         "recall_at_1_5m": recall_at(p.ranked_xy, true_xy, 1),
         "recall_at_5_5m": recall_at(p.ranked_xy, true_xy, 5),
         "recall_at_10_5m": recall_at(p.ranked_xy, true_xy, 10),
@@ -73,7 +73,11 @@ def measure(predictions: Predictions, street_names: list[str]) -> dict[str, Any]
     result["error_rate"] = error_rate(shares["street_accuracy"]) if in_street.any() else None
     result |= _distances(distance[answered])
     result["accepted_wrong"] = float(np.mean(answered & (distance > RIGHT_M)))
-    forced = {"within_0_5_m": distance <= 0.5, "within_1_m": distance <= RIGHT_M, "within_5_m": distance <= 5.0}
+    forced = {
+        "within_0_5_m": distance <= 0.5,
+        "within_1_m": distance <= RIGHT_M,
+        "within_5_m": distance <= RIGHT_PLACE_M,
+    }
     result["forced"] = _distances(distance[has_pose]) | {"answered": float(np.mean(has_pose))}
     result["forced"] |= {name: float(np.mean(flags)) for name, flags in forced.items()}
     known = np.isfinite(p.confidence)

@@ -13,7 +13,7 @@ from model_training.datasets.dataset import CameraSensor, Dataset, write_tum
 from model_training.datasets.layouts import SCANS_AT_REST
 from model_training.datasets.png import write_png
 from model_training.datasets.whole_folder import whole_or_not_at_all
-from model_training.exporting.moments import Moment, T_vehicle_camera, T_vehicle_lidar, moments, the_camera
+from model_training.exporting.moments import Moment, T_vehicle_camera, T_vehicle_lidar, moments, single_camera
 from service.geometry.rigid import Transform, inverse
 
 #: Names of the day's folder, of the drive's folder in it, and of the file of poses in that.
@@ -37,7 +37,7 @@ def write_kitti_raw(dataset: Dataset, queries: str | None, out: Path, *, report:
     Raises:
         DatasetError: ``out`` already exists, or the dataset cannot be written as one traversal.
     """
-    camera = None if queries is None else the_camera(dataset, queries)
+    camera = None if queries is None else single_camera(dataset, queries)
     total = len(dataset.survey_poses()) + (0 if queries is None else sum(1 for _ in dataset.queries(queries)))
     T_vehicle_scan = T_vehicle_lidar(dataset)
     stamps: list[float] = []

@@ -54,7 +54,7 @@ def T_vehicle_camera(camera: CameraSensor) -> Transform:
     return _AHEAD if camera.T_vehicle_sensor is None else np.array(camera.T_vehicle_sensor, np.float64)
 
 
-def the_camera(dataset: Dataset, queries: str) -> CameraSensor:
+def single_camera(dataset: Dataset, queries: str) -> CameraSensor:
     """Return the one camera of a query set.
 
     Args:

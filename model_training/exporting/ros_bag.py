@@ -9,7 +9,7 @@ import numpy as np
 
 from model_training.datasets.dataset import CameraSensor, Dataset
 from model_training.datasets.files import read_bytes
-from model_training.exporting.moments import Moment, T_vehicle_camera, T_vehicle_lidar, moments, the_camera
+from model_training.exporting.moments import Moment, T_vehicle_camera, T_vehicle_lidar, moments, single_camera
 from service.errors import DatasetError
 from service.geometry.rigid import Transform, quaternion_xyzw_from
 from service.imaging.depth_formats import read_depth_values
@@ -55,7 +55,7 @@ def write_bag(
             f"{out}: readers take the ending .bag for a ROS 1 file; choose another name for the folder",
             field="out",
         )
-    camera = None if queries is None else the_camera(dataset, queries)
+    camera = None if queries is None else single_camera(dataset, queries)
     total = len(dataset.survey_poses()) + (0 if queries is None else sum(1 for _ in dataset.queries(queries)))
     done = 0
     with _writing(out, kind) as (types, send):

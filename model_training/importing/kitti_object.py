@@ -18,7 +18,6 @@ from model_training.datasets.dataset import (
     CameraSensor,
     DatasetDescription,
     DepthSpec,
-    LidarSensor,
     Sensors,
     query_folder,
     scan_path,
@@ -28,6 +27,7 @@ from model_training.datasets.dataset import (
 from model_training.datasets.whole_folder import whole_or_not_at_all
 from model_training.importing.kitti_calibration import KittiCalibration, read_calibration
 from model_training.importing.kitti_files import copy_scan, damaged, read_rgb, read_stored_depth
+from model_training.importing.kitti_sequence import HDL64
 from model_training.importing.stereo import RECORDED, depth_from_stereo
 from service.errors import DatasetError
 from service.geometry.rigid import Transform, inverse, transform_from
@@ -40,9 +40,6 @@ PLACE_SPACING_M = 1000.0
 #: Step of KITTI's stored depth, metres; 16 bits reach 256 m.
 DEPTH_SCALE_M = 1 / 256
 _KINDS, _SUFFIXES = ("image_2", "image_3", "velodyne"), (".png", ".jpg", ".bin")
-_HDL64 = LidarSensor(
-    name="hdl-64", channels=64, top_deg=2.0, bottom_deg=-24.8, max_range_m=120.0, T_vehicle_sensor=np.eye(4).tolist()
-)
 
 
 @dataclass(frozen=True, slots=True)
@@ -151,7 +148,7 @@ class _Importer:
             DatasetDescription(
                 name=dataset_name,
                 source=self._source(),
-                sensors=Sensors(lidars=[_HDL64], cameras=self._cameras),
+                sensors=Sensors(lidars=[HDL64], cameras=self._cameras),
             ),
         )
         return KittiObjectSummary(

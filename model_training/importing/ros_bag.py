@@ -9,7 +9,7 @@ from model_training.importing.recording import PAIR_TOLERANCE_S, Event, Notes, R
 from model_training.importing.ros_cloud import points_of_cloud
 from model_training.importing.ros_content import BagSettings, content_of
 from model_training.importing.ros_frames import stamp_of
-from model_training.importing.ros_pairs import Alone, Pair, Pairing
+from model_training.importing.ros_pairs import Pair, Pairing, UnpairedImage
 from model_training.importing.ros_picture import colour_of, depth_of
 from model_training.importing.ros_reader import Damage, opened
 from model_training.importing.ros_topics import ROLES
@@ -103,7 +103,7 @@ class RosBag:
         found = points_of_cloud(message, stamp_s=stamp_s, max_points=self._settings.max_points)
         return Unusable("scan", name, found) if isinstance(found, str) else RecordedScan(name, stamp_s, *found)
 
-    def _paired(self, found: Pair | Alone) -> Event:
+    def _paired(self, found: Pair | UnpairedImage) -> Event:
         if isinstance(found, Pair):
             return self._picture(found)
         return Unusable("image", f"{found.role} at {found.stamp_s:.6f}", _WITHOUT_DEPTH)

@@ -25,7 +25,7 @@ class Pair:
 
 
 @dataclass(frozen=True, slots=True)
-class Alone:
+class UnpairedImage:
     """A message without a partner.
 
     Attributes:
@@ -49,7 +49,7 @@ class Pairing:
         self._color: deque[tuple[float, Any]] = deque()
         self._depth: deque[tuple[float, Any]] = deque()
 
-    def add(self, role: str, stamp_s: float, message: Any) -> Iterator[Pair | Alone]:
+    def add(self, role: str, stamp_s: float, message: Any) -> Iterator[Pair | UnpairedImage]:
         """Add a message, and yield what it completes.
 
         Args:
@@ -60,15 +60,15 @@ class Pairing:
         (self._color if role == "color" else self._depth).append((stamp_s, message))
         yield from self._settled(at_end=False)
         if len(self._color) > MOST_WAITING:
-            yield Alone(self._color.popleft()[0], "color")
+            yield UnpairedImage(self._color.popleft()[0], "color")
         if len(self._depth) > MOST_WAITING:
             self._depth.popleft()
 
-    def finish(self) -> Iterator[Pair | Alone]:
+    def finish(self) -> Iterator[Pair | UnpairedImage]:
         """Yield what waits at the end of the recording."""
         yield from self._settled(at_end=True)
 
-    def _settled(self, *, at_end: bool) -> Iterator[Pair | Alone]:
+    def _settled(self, *, at_end: bool) -> Iterator[Pair | UnpairedImage]:
         """Yield the colour images for which no nearer depth image can follow: a depth image at their time or later has arrived."""
         while self._color:
             stamp_s, message = self._color[0]
@@ -77,7 +77,7 @@ class Pairing:
             self._color.popleft()
             near = min(self._depth, key=lambda item: abs(item[0] - stamp_s), default=None)
             if near is None or abs(near[0] - stamp_s) > self._tolerance_s:
-                yield Alone(stamp_s, "color")
+                yield UnpairedImage(stamp_s, "color")
                 continue
             while self._depth and self._depth[0][0] < near[0]:
                 self._depth.popleft()

@@ -11,13 +11,12 @@ from numpy.typing import NDArray
 
 from model_training.datasets.dataset import Dataset, QueryFrame
 from model_training.datasets.files import read_bytes
+from service.client.grpc_messages import DEPTH_KINDS
 from service.errors import DatasetError
 from service.grpc.generated.streetfix.v1 import localization_pb2 as pb
 from service.imaging.depth_formats import read_depth_values
 from service.imaging.picture_headers import DEFAULT_LIMITS
 from service.imaging.raw16 import write_raw16
-
-_KINDS = {"z": pb.DEPTH_KIND_Z, "range": pb.DEPTH_KIND_RANGE, "disparity": pb.DEPTH_KIND_DISPARITY}
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -88,7 +87,7 @@ def _payload(frame: QueryFrame, map_name: str | None, refine: bool, cheap_depth:
         map=map_name,
         options=pb.Options(refine=refine),
         depth_format=pb.DepthFormat(
-            scale_m=spec.scale_m, kind=_KINDS[spec.kind], baseline_m=spec.baseline_m, max_range_m=spec.max_range_m
+            scale_m=spec.scale_m, kind=DEPTH_KINDS[spec.kind], baseline_m=spec.baseline_m, max_range_m=spec.max_range_m
         ),
     )
     true_m = None if frame.T_map_camera is None else frame.T_map_camera[:3, 3].copy()

@@ -17,7 +17,7 @@ from model_training.datasets.dataset import Dataset, Transforms
 from model_training.mapping.calibration_file import calibration_for
 from model_training.mapping.cloud import prepared, with_cloud
 from model_training.mapping.join import of_places
-from model_training.mapping.places import Drive, Places, streets_of, views_of
+from model_training.mapping.places import Places, SurveyTraversal, streets_of, views_of
 from model_training.mapping.settings import BuildSettings
 from model_training.mapping.site_check import HeldScan, held_out, site_of
 from model_training.mapping.stages import ResumedStages
@@ -79,13 +79,13 @@ def build_map(
         grid = ViewGrid(rows=encoder.rows, columns=encoder.columns)
         rows_seen = stages.rows_seen(grid)
         poses = stages.poses(poses)
-        drive = Drive(dataset, poses, kept, settings, encoder, grid, rows_seen)
+        drive = SurveyTraversal(dataset, poses, kept, settings, encoder, grid, rows_seen)
         return write_from(stages, drive, encoder_file, out, calibration, apart, overwrite=overwrite)
 
 
 def write_from(
     stages: ResumedStages,
-    drive: Drive,
+    drive: SurveyTraversal,
     encoder_file: Path,
     out: Path,
     calibration: Calibration | None,
@@ -159,7 +159,7 @@ def _cloud_around(poses: Transforms, settings: BuildSettings) -> VoxelMap:
     return VoxelMap(settings.voxel_m, lattice_origin(settings.voxel_m, poses[:, :3, 3].mean(axis=0)))
 
 
-def _content(drive: Drive, places: Places, encoder_file: Path, lidar_height_m: float | None) -> BundleContent:
+def _content(drive: SurveyTraversal, places: Places, encoder_file: Path, lidar_height_m: float | None) -> BundleContent:
     """Return the content of the map without its cloud and its calibration."""
     dataset, settings, part = drive.dataset, drive.settings, drive.part
     if lidar_height_m is None:
@@ -210,7 +210,7 @@ def tool_versions() -> dict[str, str]:
 
 def _checked(
     stages: ResumedStages,
-    drive: Drive,
+    drive: SurveyTraversal,
     places: Places,
     content: BundleContent,
     cloud: VoxelMap,

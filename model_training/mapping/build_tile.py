@@ -13,7 +13,7 @@ from threadpoolctl import threadpool_limits
 from model_training.datasets.survey_part import PartSource, SurveyPart
 from model_training.mapping.build import write_from
 from model_training.mapping.calibration_file import calibration_for
-from model_training.mapping.places import Drive
+from model_training.mapping.places import SurveyTraversal
 from model_training.mapping.settings import BuildSettings
 from model_training.mapping.site_check import held_out
 from model_training.mapping.stages import ResumedStages
@@ -160,7 +160,7 @@ def build_tile(task: TileTask, share: Share = lambda _: None) -> None:
         kept = np.arange(len(task.numbers))
         dataset.prepare()
         stages = ResumedStages(work, dataset, kept, task.settings, shares_of_stages(task.settings, share), task.part)
-        drive = Drive(
+        drive = SurveyTraversal(
             dataset,
             stages.poses(task.poses),
             kept,

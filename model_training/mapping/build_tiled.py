@@ -15,7 +15,7 @@ from model_training.mapping.engines import Engine, require_engine, run
 from model_training.mapping.settings import BuildSettings
 from model_training.mapping.survey import kept_scans, sampled_survey
 from model_training.mapping.tiles import require_tile_edge, tile_parts
-from model_training.mapping.work import Work, key_of, remove, work_beside
+from model_training.mapping.work import BuildCache, key_of, remove, work_beside
 from service.errors import BundleError
 from service.imaging.view_grid import ViewGrid
 from service.maps.manifest import Manifest
@@ -23,7 +23,7 @@ from service.maps.tiled_writer import write_tiled
 from service.retrieval.encoder import Encoder
 
 #: Start of the name of a tile's folder among the parts of a build.
-_TILE = "tile_"
+TILE_PREFIX = "tile_"
 
 
 def build_tiled(
@@ -91,7 +91,7 @@ def _tasks(
     encoder_file: Path,
     settings: BuildSettings,
     tile_m: float,
-    work: Work,
+    work: BuildCache,
     report: Report,
 ) -> list[TileTask]:
     """Plan the tiles: which scans and places each of them has, and what all have in common."""
@@ -111,7 +111,7 @@ def _tasks(
         source = source_of(dataset, numbers)
         of_tile = source.part(numbers, poses[numbers], scratch=dataset.folder)
         key = key_of_tile(of_tile, encoder.sha256, settings, part, common)
-        folder = work.folder / f"{_TILE}{part.square.column}_{part.square.row}_{key}"
+        folder = work.folder / f"{TILE_PREFIX}{part.square.column}_{part.square.row}_{key}"
         tasks.append(
             TileTask(
                 source,
@@ -131,10 +131,10 @@ def _tasks(
 
 def _is_of_tile(name: str) -> bool:
     """Return whether a name among the parts of a build is that of a tile, or of the parts of a tile."""
-    return name.removeprefix(".").startswith(_TILE)
+    return name.removeprefix(".").startswith(TILE_PREFIX)
 
 
-def _remove_others(work: Work, tasks: list[TileTask]) -> None:
+def _remove_others(work: BuildCache, tasks: list[TileTask]) -> None:
     """Remove the tiles of other inputs, and their parts."""
     wanted = {task.folder.name for task in tasks}
     for path in work.folder.iterdir():

@@ -65,7 +65,7 @@ class Places:
 
 
 @dataclass(frozen=True, eq=False)
-class Drive:
+class SurveyTraversal:
     """A survey traversal and the settings by which a map is built from it.
 
     Attributes:
@@ -204,7 +204,8 @@ def gathered(chunks: Iterable[Arrays], empty: VoxelMap) -> tuple[Places, VoxelMa
     """Put the chunks of a traversal together: its places, and the voxel map of its points.
 
     Args:
-        chunks: results of ``Drive.chunk``, in order. The order of sums is that of the chunks, so the result is the same to the bit.
+        chunks: results of ``SurveyTraversal.chunk``, in order. The order of sums is that of the chunks, so the result is the same to
+            the bit.
         empty: the empty voxel map of the chunks.
     """
     cloud, fields = VoxelMap(empty.voxel_m, empty.origin), list[Arrays]()

@@ -7,6 +7,7 @@ from pathlib import Path
 from model_training.datasets.dataset import MOST_SURVEY_STD_DEG, MOST_SURVEY_STD_M, SurveyAccuracy
 from model_training.stock import CALIBRATION
 from service.errors import DatasetError
+from service.imaging.pca import USUAL_LIDAR_HEIGHT_M
 from service.maps.manifest import Manifest
 
 
@@ -39,7 +40,7 @@ class BuildSettings:
     between_m: float = 3.0
     headings: int = 24
     voxel_m: float = 0.3
-    expected_lidar_height_m: float = 1.8
+    expected_lidar_height_m: float = USUAL_LIDAR_HEIGHT_M
     remove_weather: bool = False
     passes_vote: bool = False
     traffic_vote: bool = True

@@ -11,12 +11,12 @@ from numpy.typing import NDArray
 from model_training.datasets.dataset import Dataset
 from model_training.mapping.align_survey import aligned
 from model_training.mapping.passes import Vote
-from model_training.mapping.places import Drive, Places, gathered
+from model_training.mapping.places import Places, SurveyTraversal, gathered
 from model_training.mapping.settings import BuildSettings
 from model_training.mapping.survey import sampled_survey
 from model_training.mapping.tiles import TilePart
 from model_training.mapping.voxel_map import VoxelMap
-from model_training.mapping.work import Arrays, Work
+from model_training.mapping.work import Arrays, BuildCache
 from service.imaging.view_grid import ViewGrid
 from service.maps.calibration import Calibration, Site
 
@@ -37,7 +37,7 @@ class ResumedStages:
         part: the part of the survey that becomes a tile; None for all of it.
     """
 
-    work: Work
+    work: BuildCache
     dataset: Dataset
     kept: NDArray[np.int64]
     settings: BuildSettings
@@ -66,7 +66,9 @@ class ResumedStages:
             "poses", lambda: {"aligned": aligned(self.dataset, given, self.kept, report=self.report)}
         )["aligned"]
 
-    def places(self, drive: Drive, empty: VoxelMap, *, apart: Set[int] = frozenset()) -> tuple[Places, VoxelMap]:
+    def places(
+        self, drive: SurveyTraversal, empty: VoxelMap, *, apart: Set[int] = frozenset()
+    ) -> tuple[Places, VoxelMap]:
         """Return the places of the survey and the voxel map of its points.
 
         Args:

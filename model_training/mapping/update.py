@@ -13,7 +13,7 @@ from model_training.mapping.area import Area, covered_by, polygon_of
 from model_training.mapping.build import tool_versions
 from model_training.mapping.cloud import with_cloud
 from model_training.mapping.join import joined, joined_streets, of_places
-from model_training.mapping.places import Drive, Places, views_of
+from model_training.mapping.places import Places, SurveyTraversal, views_of
 from model_training.mapping.settings import BuildSettings
 from model_training.mapping.stages import ResumedStages
 from model_training.mapping.stored_map import content_of, empty_voxels_of, streets_of_bundle, voxels_of
@@ -153,7 +153,7 @@ def update_map(
     with work_beside(out, key) as work:
         stages = ResumedStages(work, dataset, kept, settings, report)
         require_rows(stages.rows_seen(bundle.grid), bundle, dataset)
-        drive = Drive(dataset, stages.poses(poses), kept, settings, encoder, bundle.grid, bundle.rows_seen)
+        drive = SurveyTraversal(dataset, stages.poses(poses), kept, settings, encoder, bundle.grid, bundle.rows_seen)
         content, cloud = updated(stages, drive, content_of(bundle), voxels_of(bundle), replacement)
         report("writing", 0, 2)
         whole = with_cloud(replace(content, tool_versions=tool_versions()), cloud)
@@ -164,7 +164,7 @@ def update_map(
 
 
 def updated(
-    stages: ResumedStages, drive: Drive, content: BundleContent, cloud: VoxelMap, replacement: Replacement
+    stages: ResumedStages, drive: SurveyTraversal, content: BundleContent, cloud: VoxelMap, replacement: Replacement
 ) -> tuple[BundleContent, VoxelMap]:
     """Add a survey to the content of a map, or to that of a tile; return the new content, without a cloud, and its voxels.
 
@@ -250,7 +250,7 @@ def require_rows(rows_seen: NDArray[np.bool_], bundle: Map, dataset: Dataset) ->
         )
 
 
-def _content(drive: Drive, places: Places, old: BundleContent) -> BundleContent:
+def _content(drive: SurveyTraversal, places: Places, old: BundleContent) -> BundleContent:
     """Return the new traversal as a map of its own, with the encoder and the settings of the old map."""
     lidar_height_m = float(np.median(places.height_m)) if len(places.height_m) else old.parameters["lidar_height_m"]
     T_map_place = places.at_height(lidar_height_m)

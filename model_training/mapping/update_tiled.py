@@ -14,9 +14,10 @@ from model_training.datasets.survey_part import SurveyPart
 from model_training.mapping.area import Area
 from model_training.mapping.build import tool_versions
 from model_training.mapping.build_tile import Share, shares_of_stages
+from model_training.mapping.build_tiled import TILE_PREFIX
 from model_training.mapping.cloud import with_cloud
 from model_training.mapping.join import joined_streets, of_places
-from model_training.mapping.places import Drive, streets_of
+from model_training.mapping.places import SurveyTraversal, streets_of
 from model_training.mapping.settings import BuildSettings
 from model_training.mapping.stages import ResumedStages
 from model_training.mapping.stored_map import content_of, streets_of_bundle, voxel_edge_m, voxels_of
@@ -25,7 +26,7 @@ from model_training.mapping.tiled_care import Square, tiles_of
 from model_training.mapping.tiles import TILE_MARGIN_M, TilePart, places_xy, tile_parts
 from model_training.mapping.update import Replacement, require_frame, require_rows, updated, without
 from model_training.mapping.voxel_map import MOMENTS, VoxelMap, lattice_origin
-from model_training.mapping.work import Work, key_of, work_beside
+from model_training.mapping.work import BuildCache, key_of, work_beside
 from service.errors import BundleError
 from service.maps.content import BundleContent
 from service.maps.manifest import FILE, Manifest, read_manifest
@@ -38,7 +39,6 @@ from service.retrieval.encoder import Encoder
 #: Progress callback: stage, finished steps, all steps.
 Report = Callable[[str, int, int], None]
 #: Start of the name of a tile's folder among the parts of an update.
-_TILE = "tile_"
 #: Parameters of a tile that count something.
 _COUNTED = ("survey_scans", "places_between")
 
@@ -187,7 +187,7 @@ class _Tile:
             replaced=self.replacement.key,
             streets=json.dumps(self.streets, sort_keys=True),
         )
-        folder = store / f"{_TILE}{part.square.column}_{part.square.row}_{key}"
+        folder = store / f"{TILE_PREFIX}{part.square.column}_{part.square.row}_{key}"
         if (folder / FILE).is_file():
             return folder
         with work_beside(folder, key) as work:
@@ -198,7 +198,7 @@ class _Tile:
         return folder
 
     def _content(
-        self, bundle: MapBundle, settings: BuildSettings, work: Work, report: Report
+        self, bundle: MapBundle, settings: BuildSettings, work: BuildCache, report: Report
     ) -> tuple[BundleContent, VoxelMap]:
         """Return the content of the new tile without a cloud, and its voxels."""
         poses, kept = self.dataset.survey_poses(), np.arange(len(self.part.order))
@@ -214,7 +214,7 @@ class _Tile:
             content = content if area is None else without(content, cloud, area)
             return replace(content, place_street=streets_of(self.streets, content.T_map_place)), cloud
         stages = ResumedStages(work, self.dataset, kept, settings, report, self.part)
-        drive = Drive(
+        drive = SurveyTraversal(
             self.dataset, stages.poses(poses), kept, settings, self.encoder, bundle.grid, bundle.rows_seen, self.part
         )
         return updated(stages, drive, content, cloud, self.replacement)
@@ -294,7 +294,7 @@ def _square(part: TilePart) -> Square:
 
 def _is_of_tile(name: str) -> bool:
     """Return whether a name among the parts of an update is that of a tile, or of the parts of a tile."""
-    return name.removeprefix(".").startswith(_TILE)
+    return name.removeprefix(".").startswith(TILE_PREFIX)
 
 
 def _has_any(tile: Path, area: Area | None) -> bool:

@@ -42,7 +42,7 @@ _CODE = (
 )
 
 
-class Work:
+class BuildCache:
     """The store for the finished parts of one build.
 
     Args:
@@ -94,7 +94,7 @@ class Work:
 @contextmanager
 def work_beside(
     out: Path, key: str, *, also: Callable[[str], bool] = lambda _: False, wait_s: float = 0.0
-) -> Iterator[Work]:
+) -> Iterator[BuildCache]:
     """Provide the store of an output as a context, locked against other processes.
 
     The folder is removed at the end of the context. After an exception it stays if it holds a finished part.
@@ -125,7 +125,7 @@ def work_beside(
         for partial in out.parent.glob(f".{out.name}.*.partial"):
             shutil.rmtree(partial)
         try:
-            yield Work(folder, key)
+            yield BuildCache(folder, key)
         except BaseException:
             if [path.name for path in folder.iterdir()] == [_LOCK]:  # no part is finished
                 shutil.rmtree(folder)

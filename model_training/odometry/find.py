@@ -16,13 +16,14 @@ from model_training.odometry.pose_graph import closed, disagreement_m
 from model_training.odometry.scan_to_map import posed
 from model_training.stock import ENCODER
 from service.errors import DatasetError
+from service.imaging.pca import USUAL_LIDAR_HEIGHT_M
 from service.retrieval.encoder import Encoder
 
 Report = Callable[[str, int, int], None]
 
 
 @dataclass(frozen=True, slots=True)
-class Found:
+class TrajectoryResult:
     """Result of odometry and loop closure.
 
     Attributes:
@@ -39,8 +40,12 @@ class Found:
 
 
 def find_trajectory(
-    recording: Recording, *, close_loops: bool = True, expected_height_m: float = 1.8, report: Report = lambda *_: None
-) -> Found:
+    recording: Recording,
+    *,
+    close_loops: bool = True,
+    expected_height_m: float = USUAL_LIDAR_HEIGHT_M,
+    report: Report = lambda *_: None,
+) -> TrajectoryResult:
     """Follow the scans of a recording, and close loops at places that the traversal visits again.
 
     Args:
@@ -70,9 +75,9 @@ def find_trajectory(
         before = Trajectory(drive.stamps_s, drive.T_first_lidar, name).moved_by(T_vehicle_lidar)
         loops = find_loops(drive, report=lambda done, of: report("loops", done, of)) if close_loops else []
         if not loops:
-            return Found(before, before, 0, (0.0, 0.0))
+            return TrajectoryResult(before, before, 0, (0.0, 0.0))
         T = closed(drive, loops)
         rows = np.searchsorted(drive.stamps_s, [keyframe.stamp_s for keyframe in drive.keyframes])
         away = (disagreement_m(drive.T_first_lidar[rows], loops), disagreement_m(T[rows], loops))
         after = Trajectory(drive.stamps_s, T, f"{name}, {len(loops)} loops closed").moved_by(T_vehicle_lidar)
-        return Found(after, before, len(loops), away)
+        return TrajectoryResult(after, before, len(loops), away)

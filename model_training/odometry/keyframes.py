@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from model_training.mapping.survey import fan
 from model_training.odometry.scan_to_map import PosedScan
 from service.geometry.rigid import Transform
-from service.imaging.pca import Level, level_scan, principal_heading
+from service.imaging.pca import USUAL_LIDAR_HEIGHT_M, Level, level_scan, principal_heading
 from service.imaging.view_grid import ViewGrid, panorama_from_points, survey_planes, view_from_panorama
 from service.retrieval.encoder import Encoder
 
@@ -47,7 +47,7 @@ class Keyframe:
 
 
 @dataclass(frozen=True)
-class Drive:
+class OdometryTrajectory:
     """A traversal from odometry.
 
     Attributes:
@@ -77,9 +77,9 @@ def drive_of(
     encoder: Encoder | None,
     folder: Path,
     *,
-    expected_height_m: float = 1.8,
+    expected_height_m: float = USUAL_LIDAR_HEIGHT_M,
     report: Callable[[int], None] = lambda _: None,
-) -> Drive:
+) -> OdometryTrajectory:
     """Collect poses and keyframes of a traversal.
 
     Args:
@@ -102,7 +102,7 @@ def drive_of(
             np.save(folder / f"{len(keyframes):06d}.npy", _thinned(scan.points[:, :3]))
             keyframes.append(_keyframe(scan, len(keyframes), travelled_m, encoder, expected_height_m))
         report(done)
-    return Drive(np.array(stamps), np.array(poses).reshape(-1, 4, 4), tuple(keyframes), folder)
+    return OdometryTrajectory(np.array(stamps), np.array(poses).reshape(-1, 4, 4), tuple(keyframes), folder)
 
 
 def _keyframe(scan: PosedScan, index: int, travelled_m: float, encoder: Encoder, expected_height_m: float) -> Keyframe:

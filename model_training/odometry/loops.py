@@ -8,7 +8,7 @@ from jaxtyping import Float64
 from numpy.typing import NDArray
 
 from model_training.mapping.voxel_map import VoxelMap
-from model_training.odometry.keyframes import HEADINGS, Drive, Keyframe
+from model_training.odometry.keyframes import HEADINGS, Keyframe, OdometryTrajectory
 from service.geometry.rigid import Transform, inverse, rotation_z, transform_from, transform_points
 from service.registration.kernel import QueryPoints
 from service.registration.register import RegistrationSettings, Start, register
@@ -64,7 +64,10 @@ class Loop:
 
 
 def find_loops(
-    drive: Drive, settings: LoopSettings = LoopSettings(), *, report: Callable[[int, int], None] = lambda *_: None
+    drive: OdometryTrajectory,
+    settings: LoopSettings = LoopSettings(),
+    *,
+    report: Callable[[int, int], None] = lambda *_: None,
 ) -> list[Loop]:
     """Find loops of a traversal, at most one per keyframe that is looked up.
 
@@ -119,7 +122,7 @@ def all_round(
 
 
 def _proved(
-    drive: Drive, later: Keyframe, earlier: Keyframe, turn: int, similarity: float, settings: LoopSettings
+    drive: OdometryTrajectory, later: Keyframe, earlier: Keyframe, turn: int, similarity: float, settings: LoopSettings
 ) -> Loop | None:
     """Register the later visit against the cloud of the earlier one; None if too few points are inliers."""
     cloud = _cloud(drive, earlier, settings)
@@ -134,7 +137,7 @@ def _proved(
     return Loop(earlier.index, later.index, inverse(earlier.T_first_lidar) @ T_first_later, found.inliers, similarity)
 
 
-def _cloud(drive: Drive, middle: Keyframe, settings: LoopSettings) -> SurfelMap:
+def _cloud(drive: OdometryTrajectory, middle: Keyframe, settings: LoopSettings) -> SurfelMap:
     """Surfels of the keyframes around one, in the odometry frame."""
     voxels = VoxelMap(settings.voxel_m, np.round(middle.T_first_lidar[:3, 3]))
     low, high = max(0, middle.index - settings.around), middle.index + settings.around + 1
@@ -143,7 +146,7 @@ def _cloud(drive: Drive, middle: Keyframe, settings: LoopSettings) -> SurfelMap:
     return SurfelMap.prepare(voxels.origin, *voxels.surfels())
 
 
-def _query_points(drive: Drive, keyframe: Keyframe, settings: LoopSettings) -> QueryPoints:
+def _query_points(drive: OdometryTrajectory, keyframe: Keyframe, settings: LoopSettings) -> QueryPoints:
     xyz = drive.points(keyframe.index) @ keyframe.level.R_level_sensor.T.astype(np.float32)
     rows = np.linspace(0, len(xyz) - 1, min(settings.points, len(xyz))).astype(np.intp)
     chosen = np.ascontiguousarray(xyz[rows], np.float32)

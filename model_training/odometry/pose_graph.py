@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float64
 from numpy.typing import NDArray
 
-from model_training.odometry.keyframes import Drive
+from model_training.odometry.keyframes import OdometryTrajectory
 from model_training.odometry.loops import Loop
 from service.geometry.rigid import inverse
 
@@ -23,7 +23,7 @@ ROBUST = 3.0
 Transforms = Float64[NDArray[np.float64], "N 4 4"]
 
 
-def closed(drive: Drive, loops: list[Loop]) -> Transforms:
+def closed(drive: OdometryTrajectory, loops: list[Loop]) -> Transforms:
     """Return T_first_lidar of every scan after loop closure (N, 4, 4).
 
     Between keyframes the correction of the keyframe before is applied rigidly. So the relative poses of neighbouring scans
@@ -85,7 +85,7 @@ def held_near(T_map_steps: Transforms, T_map_given: Transforms) -> Transforms:
     return np.stack([solved.atPose3(k).matrix() for k in range(len(T_map_given))])
 
 
-def _solved(drive: Drive, loops: list[Loop]) -> Transforms:
+def _solved(drive: OdometryTrajectory, loops: list[Loop]) -> Transforms:
     import gtsam
 
     graph, start = gtsam.NonlinearFactorGraph(), gtsam.Values()

@@ -10,13 +10,12 @@ from model_training.evaluation.failures import position_errors
 from model_training.evaluation.predict import Predictions
 from model_training.reporting.pictures import grey_webp_uri
 from service.maps.map import Map
+from service.registration.surfel_tiles import DRAWN_TILES
 
 #: Classes of error: upper limit in metres, style class, and text of the legend.
 ERRORS = ((0.5, "e0", "up to 0.5 m"), (1.0, "e1", "up to 1 m"), (5.0, "e2", "up to 5 m"), (np.inf, "e3", "over 5 m"))
 _LONGEST_PX = 1400
 _MARGIN_M = 8.0
-#: Largest number of tiles of a tiled map that are drawn, evenly chosen.
-_MOST_TILES = 64
 #: Surfels are walls if the vertical part of their normal is smaller.
 _UPRIGHT = 0.5
 _GROUND_ID = "ground"
@@ -43,7 +42,7 @@ class Plan:
         """
         places = bundle.T_map_place[:, :2, 3]
         xy, upright = places, np.zeros(0, bool)
-        drawn = () if bundle.cloud is None else bundle.cloud.parts(_MOST_TILES)
+        drawn = () if bundle.cloud is None else bundle.cloud.parts(DRAWN_TILES)
         if any(len(part.surfels) for part in drawn):
             surfels = [part.unpacked(np.s_[:]) for part in drawn]
             xy = np.concatenate(

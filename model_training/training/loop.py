@@ -239,7 +239,7 @@ def train(
             known = memory.recent(step, config.memory_steps) if remembers else np.zeros(0, np.int64)
             if len(known) > config.pairs:
                 seeds = rng.choice(known, min(config.alike_seeds, len(known)), replace=False)
-                wanted = together.of_first(memory.alike(seeds, known, config.alike_each))
+                wanted = together.of_first(memory.hard_negatives(seeds, known, config.alike_each))
             choice = cities[number].choose(config.pairs, rng, wanted)
             bounds = shard_bounds(len(choice), config.shards)
             planes = _own_views(cities[number], choice, bounds, together, augment, config, step)

@@ -20,12 +20,9 @@ from model_training.simulation.shading import Light
 from model_training.simulation.stereo_pair import StereoModel, StereoRig
 from service.geometry.camera import PinholeCamera
 from service.geometry.rigid import R_BODY_OPTICAL, Transform, heading_of_camera
-from service.imaging.level import level_camera
+from service.imaging.level import USUAL_HEIGHT_M, level_camera
 from service.imaging.resample import resample
 from service.imaging.view_grid import ViewGrid
-
-#: Camera height if the image shows no ground, metres; the same value as in the service.
-NOMINAL_HEIGHT_M = 1.5
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,7 +65,7 @@ class MatchedView:
     height_m: float
 
 
-class RigOfADrive:
+class TraversalRig:
     """A rig in a scene, with the rectification errors of one traversal.
 
     Args:
@@ -114,7 +111,7 @@ class RigOfADrive:
             for T in (T_map_camera, T_map_camera @ self._stereo.T_left_right)
         )
         depth_m = self._stereo.depth(left, right)
-        level = level_camera(depth_m, self._rig.camera, down_camera=None, nominal_height_m=NOMINAL_HEIGHT_M)
+        level = level_camera(depth_m, self._rig.camera, down_camera=None, nominal_height_m=USUAL_HEIGHT_M)
         ranges, colour, seen = resample(left, depth_m, self._rig.camera, level.R_level_camera.T, grid)
         rgb = np.rint(colour).clip(0, 255).astype(np.uint8)
         return MatchedView(ranges, rgb, seen, heading_of_camera(T_map_camera), level.height_m)

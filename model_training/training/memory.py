@@ -73,7 +73,7 @@ class DescriptorMemory:
         rows: NDArray[np.int64] = np.flatnonzero((step - self.step.numpy()) <= oldest)
         return rows
 
-    def alike(self, seeds: NDArray[np.int64], among: NDArray[np.int64], each: int) -> NDArray[np.int64]:
+    def hard_negatives(self, seeds: NDArray[np.int64], among: NDArray[np.int64], each: int) -> NDArray[np.int64]:
         """Find hard negatives: pairs of other places whose survey views are most similar to a query.
 
         Args:

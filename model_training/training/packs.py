@@ -24,7 +24,7 @@ from model_training.simulation.meshes import joined
 from model_training.simulation.scene import Scene
 from model_training.simulation.shading import Light, shade, to_srgb
 from model_training.simulation.traversal import lidar_pose, stations, upright_on
-from model_training.training.matched_views import MatchedRig, RigOfADrive
+from model_training.training.matched_views import MatchedRig, TraversalRig
 from service.geometry.rigid import heading_of_body, rotation_x, rotation_y, rotation_z, transform_from
 from service.imaging.pca import level_scan
 from service.imaging.view_grid import ViewGrid, panorama_from_points
@@ -235,7 +235,7 @@ def _matched_queries(
             if row * plan.queries_a_place // total != traversal:
                 traversal = row * plan.queries_a_place // total
                 scene = Scene(joined([city.static, city.occupants(OWN_DRIVES + traversal)]))
-            drive = RigOfADrive(rig, scene, city, rng)
+            drive = TraversalRig(rig, scene, city, rng)
         for _ in range(6):
             x, y, heading = _near(places[place], rng)
             roll, pitch = np.deg2rad(rng.normal(0, 0.6, 2))

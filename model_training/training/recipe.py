@@ -19,7 +19,7 @@ from model_training.training.random_rigs import HEIGHT_M, random_rigs
 #: Seeds of the training cities.
 TRAINING_SEEDS = range(1000, 2000)
 #: Seeds of the validation cities.
-WATCH_SEEDS = range(2000, 3000)
+VALIDATION_SEEDS = range(2000, 3000)
 #: Seeds of the calibration cities.
 CALIBRATION_SEEDS = range(3000, 4000)
 #: Seeds of the evaluation cities.
@@ -170,9 +170,9 @@ def _surveyed(first: int, cities: int) -> list[PackPlan]:
     ]
 
 
-def watch_plans() -> list[PackPlan]:
+def validation_plans() -> list[PackPlan]:
     """Plan the validation city of the training."""
-    return [PackPlan(seed=WATCH_SEEDS[0], places=900, queries_a_place=1)]
+    return [PackPlan(seed=VALIDATION_SEEDS[0], places=900, queries_a_place=1)]
 
 
 def paper_plans() -> list[PackPlan]:

@@ -7,9 +7,7 @@ import numpy as np
 from model_training.viewing.events import Cloud, Event, Outlines, Track
 from service.maps.map import Map
 from service.maps.streets import Streets
-
-#: Largest number of tiles of a tiled map that are shown, evenly chosen.
-MOST_TILES = 64
+from service.registration.surfel_tiles import DRAWN_TILES
 
 
 def events_of_map(bundle: Map, *, most_points: int) -> Iterator[Event]:
@@ -19,7 +17,7 @@ def events_of_map(bundle: Map, *, most_points: int) -> Iterator[Event]:
         bundle: the map.
         most_points: largest number of points; a larger cloud shows each n-th surfel.
     """
-    drawn = () if bundle.cloud is None else bundle.cloud.parts(MOST_TILES)
+    drawn = () if bundle.cloud is None else bundle.cloud.parts(DRAWN_TILES)
     for number, part in enumerate(drawn):
         surfels = part.unpacked(np.s_[:: max(1, -(-len(part.surfels) * len(drawn) // most_points))])
         upright = 1 - np.abs(surfels["normal"][:, 2])

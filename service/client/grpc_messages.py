@@ -6,7 +6,8 @@ from service.client.prepare import PreparedRequest
 from service.contract import schema
 from service.grpc.generated.streetfix.v1 import localization_pb2 as pb
 
-_KINDS = {"z": pb.DEPTH_KIND_Z, "range": pb.DEPTH_KIND_RANGE, "disparity": pb.DEPTH_KIND_DISPARITY}
+#: Value of the gRPC enumeration for each kind of depth.
+DEPTH_KINDS = {"z": pb.DEPTH_KIND_Z, "range": pb.DEPTH_KIND_RANGE, "disparity": pb.DEPTH_KIND_DISPARITY}
 _LENSES = {
     "brown_conrady": pb.DISTORTION_MODEL_UNSPECIFIED,
     "kannala_brandt": pb.DISTORTION_MODEL_KANNALA_BRANDT,
@@ -186,7 +187,7 @@ def _camera(camera: schema.Camera) -> pb.Camera:
 
 def _depth(depth: schema.Depth) -> pb.DepthFormat:
     return pb.DepthFormat(
-        scale_m=depth.scale_m, kind=_KINDS[depth.kind], max_range_m=depth.max_range_m, baseline_m=depth.baseline_m
+        scale_m=depth.scale_m, kind=DEPTH_KINDS[depth.kind], max_range_m=depth.max_range_m, baseline_m=depth.baseline_m
     )
 
 

@@ -9,13 +9,11 @@ from numpy.typing import NDArray
 
 from service.maps.map import Map
 from service.registration.surfel_map import SurfelMap
-from service.registration.surfel_tiles import Cloud
+from service.registration.surfel_tiles import DRAWN_TILES, Cloud
 
 #: ``points`` is rounded down to one of these, so that few clouds are computed and kept.
 LEVELS = (20_000, 50_000, 100_000, 200_000, 500_000, 1_000_000, 2_000_000)
 _KEPT = 2
-#: Largest number of tiles of a tiled map that are drawn. Each one is read from the disk.
-MOST_TILES = 64
 CLOUD_MAGIC, PLACES_MAGIC = b"SFC1", b"SFP1"
 #: x, y, z in steps of the header, and how upright the surface is: 0 flat ground, 65535 a wall.
 _POINT = np.dtype([("xyz", "<u2", (3,)), ("upright", "<u2")])
@@ -58,7 +56,7 @@ def cloud_bytes(cloud: Cloud | None, most: int) -> bytes:
         cloud: cloud of a map; None for a map without a cloud.
         most: most points.
     """
-    parts = () if cloud is None else cloud.parts(MOST_TILES)
+    parts = () if cloud is None else cloud.parts(DRAWN_TILES)
     if not any(len(part.surfels) for part in parts):
         return CLOUD_MAGIC + struct.pack("<I6d", 0, *(0.0,) * 3, *(1.0,) * 3)
     origin_m, xyz, upright = parts[0].origin_m, [], []

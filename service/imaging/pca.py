@@ -21,6 +21,8 @@ GROUND_NEAR_M = 2.0
 #: Side of a ground cell, metres. Each cell gives one point. Otherwise the dense near field would dominate the fit.
 GROUND_CELL_M = 1.0
 
+#: Height of a survey's LiDAR above the ground if nothing else is known, metres.
+USUAL_LIDAR_HEIGHT_M = 1.8
 #: Side of a column, metres. Each column has one vote. Otherwise the nearest wall would dominate the heading.
 HEADING_CELL_M = 0.5
 #: Columns on each side of a column whose principal axis is its vote.
@@ -93,7 +95,7 @@ def project(points: Float[NDArray[np.floating], "N D"], components: Components) 
     return result
 
 
-def level_scan(points: Cloud, *, expected_height_m: float = 1.8, height_slack_m: float = 1.0) -> Level:
+def level_scan(points: Cloud, *, expected_height_m: float = USUAL_LIDAR_HEIGHT_M, height_slack_m: float = 1.0) -> Level:
     """Find the local ground of a scan by PCA of its lowest points, and the rotation that makes it horizontal.
 
     The lowest point of each 1 m cell, from 2 m to 18 m, represents the ground. PCA fits a plane: its normal is the axis of least

@@ -22,7 +22,7 @@ from service.registration.covariance import (
 from service.registration.kernel import QueryPoints
 from service.registration.local_search import LocalSearchSettings, search_locally
 from service.registration.points import FOCAL_BASELINE_PX_M, PointSettings
-from service.registration.rays import RaySettings, adjust
+from service.registration.rays import OFFSET_PX, RaySettings, adjust
 from service.registration.register import Registered, RegistrationSettings, Start, register
 from service.registration.restarts import RestartSettings, difference, spread_of_restarts
 from service.registration.surfel_tiles import Cloud
@@ -37,6 +37,8 @@ from service.scoring.photometry import BrightnessScorer, PhotometrySettings
 from service.scoring.similarity import similarity_of
 from service.scoring.structure import StructureScorer
 from service.scoring.support import LocalScoreWeights, PoseScorer, SupportWeights, scorers_of
+
+_Covariance = Float64[NDArray[np.float64], "6 6"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -89,10 +91,6 @@ def settings_for_rig(settings: RefineSettings, focal_baseline_px_m: float) -> Re
     )
 
 
-#: Standard deviation of a rig's disparity offset, px. With SGBM the offset was 0.1 to 0.46 px on real frames (feasibility study).
-OFFSET_PX = 0.6
-
-
 def refine(
     bundle: Map,
     cloud: Cloud,
@@ -138,14 +136,7 @@ def refine(
     found = register(cloud, points, starts, reference.views.height_m, settings.registration)
     # 3. Scores, and other local minima around the best pose.
     raycasters = Raycasters(cloud, settings.rays)
-    scorer = PoseScorer(
-        measured,
-        scorers_of(bundle, cloud, measured, prior, settings.support),
-        StructureScorer(cloud, measured, settings.support.structure),
-        BrightnessScorer(raycasters, measured, settings.photometry),
-        settings.support,
-        settings.near,
-    )
+    scorer = _scorer_of(bundle, cloud, raycasters, measured, prior, settings)
     candidates = scorer.with_details(scorer.candidates(found))
     independent = float(np.median([frame.independent_noise for frame in frames]))
     if scorer.brightness.is_known and independent >= settings.around.from_noise:
@@ -156,15 +147,13 @@ def refine(
     # 4. Adjustment of the best pose along the rays, its comparison with poses next to it, and its covariance.
     noise = float(np.median([frame.noise for frame in frames]))
     final = _adjusted(cloud, raycasters, scorer, points, candidates[0], noise, settings)
-    systematic = survey_covariance(*bundle.manifest.survey_std) + relative_pose_covariance(len(frames))
-    if reference.query.baseline_m is not None:
-        systematic = systematic + rectification_covariance(reference.views.height_m, reference.query.baseline_m)
+    systematic = _systematic_covariance(bundle, frames)
     covariance = final.covariance + systematic
     candidates[0] = replace(
         candidates[0], T_map_camera=final.T_map_camera, registered=final.pose, covariance=covariance
     )
 
-    def covariance_at(candidate: Candidate) -> Float64[NDArray[np.float64], "6 6"]:
+    def covariance_at(candidate: Candidate) -> _Covariance:
         pose = candidate.registered
         scatter_at = score_outer_product(cloud.at(pose.camera_m), points, pose, settings.registration)
         heading_at = heading_of_camera(candidate.T_map_camera)
@@ -181,6 +170,34 @@ def refine(
     )
 
 
+def _scorer_of(
+    bundle: Map,
+    cloud: Cloud,
+    raycasters: Raycasters,
+    measured: tuple[MeasuredFrame, ...],
+    prior: Prior | None,
+    settings: RefineSettings,
+) -> PoseScorer:
+    """Return the scorer of the candidates of one query."""
+    return PoseScorer(
+        measured,
+        scorers_of(bundle, cloud, measured, prior, settings.support),
+        StructureScorer(cloud, measured, settings.support.structure),
+        BrightnessScorer(raycasters, measured, settings.photometry),
+        settings.support,
+        settings.near,
+    )
+
+
+def _systematic_covariance(bundle: Map, frames: tuple[EncodedFrame, ...]) -> _Covariance:
+    """Return the covariance of errors that no residual shows: of the survey, the odometry and the rectification."""
+    reference = frames[0]
+    systematic = survey_covariance(*bundle.manifest.survey_std) + relative_pose_covariance(len(frames))
+    if reference.query.baseline_m is not None:
+        systematic = systematic + rectification_covariance(reference.views.height_m, reference.query.baseline_m)
+    return systematic
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class _Adjusted:
     """The final pose, the scatter of its patches' gradients, its comparison with poses next to it, and its covariance.
@@ -192,7 +209,7 @@ class _Adjusted:
     T_map_camera: Transform
     scatter: Float64[NDArray[np.float64], "8 8"]
     confirmation: Confirmation
-    covariance: Float64[NDArray[np.float64], "6 6"]
+    covariance: _Covariance
 
 
 def _adjusted(

@@ -9,13 +9,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from service.errors import BundleError
+from service.errors import BundleError, damaged_file
 from service.imaging.npy_header import NPY_HEADER_ERRORS
 from service.maps import content as parts
 from service.maps.manifest import FileEntry, Manifest
 from service.maps.writer import sha256_of
 
-REMEDY = "copy or build the bundle again"
 #: Threads that hash the files of a bundle. hashlib releases the interpreter lock.
 _HASHING_THREADS = 4
 
@@ -34,25 +33,25 @@ def require_files(path: Path, manifest: Manifest, needed: Iterable[str], *, veri
     """
     for name in needed:
         if name not in manifest.files:
-            raise defect(path / name, "not listed in the manifest")
+            raise damaged_file(path / name, "not listed in the manifest")
     compared: list[tuple[Path, FileEntry]] = []
     for name, entry in manifest.files.items():
         file = path / name
         if name in parts.NOT_SERVED and not file.exists():
             continue
         if not file.is_file() or not file.resolve().is_relative_to(path.resolve()):
-            raise defect(file, "missing, or outside the bundle")
+            raise damaged_file(file, "missing, or outside the bundle")
         try:
             size = file.stat().st_size
         except OSError as error:  # for example, somebody removes the bundle meanwhile
             raise _unreadable(file, error) from error
         if size != entry.size:
-            raise defect(file, f"{size} bytes instead of {entry.size}")
+            raise damaged_file(file, f"{size} bytes instead of {entry.size}")
         if verify and name not in parts.NOT_SERVED:
             compared.append((file, entry))
     _compare_hashes(compared)
     if manifest.files[parts.ENCODER_FILE].sha256 != manifest.encoder_sha256:
-        raise defect(path / parts.ENCODER_FILE, "not the encoder that computed the descriptors")
+        raise damaged_file(path / parts.ENCODER_FILE, "not the encoder that computed the descriptors")
 
 
 def _compare_hashes(files: list[tuple[Path, FileEntry]]) -> None:
@@ -66,7 +65,7 @@ def _compare_hashes(files: list[tuple[Path, FileEntry]]) -> None:
     with ThreadPoolExecutor(min(len(files), _HASHING_THREADS)) as threads:
         for (file, entry), found in zip(files, threads.map(_hash_of, [file for file, _ in files]), strict=True):
             if found != entry.sha256:
-                raise defect(file, "the hash does not match the manifest")
+                raise damaged_file(file, "the hash does not match the manifest")
 
 
 def _hash_of(file: Path) -> str:
@@ -77,7 +76,7 @@ def _hash_of(file: Path) -> str:
 
 
 def _unreadable(file: Path, error: OSError) -> BundleError:
-    return defect(file, f"cannot be read ({error.strerror})")
+    return damaged_file(file, f"cannot be read ({error.strerror})")
 
 
 def read_file(path: Path) -> bytes:
@@ -108,9 +107,9 @@ def map_array(path: Path, *, expected: np.dtype[Any] | None) -> NDArray[Any]:
     try:
         array = np.load(path, allow_pickle=False, mmap_mode="r")
     except (OSError, *NPY_HEADER_ERRORS) as error:
-        raise defect(path, f"not a valid NPY array ({error})") from error
+        raise damaged_file(path, f"not a valid NPY array ({error})") from error
     if expected is not None and (array.dtype != expected or array.ndim != 1):
-        raise defect(path, f"{array.dtype} in {array.ndim} dimensions instead of {expected} in 1")
+        raise damaged_file(path, f"{array.dtype} in {array.ndim} dimensions instead of {expected} in 1")
     return array  # type: ignore[no-any-return]  # np.load is not typed for one array
 
 
@@ -127,17 +126,7 @@ def json_object(content: bytes, path: Path) -> dict[str, Any]:
     try:
         document = json.loads(content)
     except (ValueError, RecursionError) as error:
-        raise defect(path, "not valid JSON") from error
+        raise damaged_file(path, "not valid JSON") from error
     if not isinstance(document, dict):
-        raise defect(path, "not a JSON object")
+        raise damaged_file(path, "not a JSON object")
     return document
-
-
-def defect(path: Path, what: str) -> BundleError:
-    """Return the error for a defect of a file.
-
-    Args:
-        path: the file.
-        what: what is wrong.
-    """
-    return BundleError(f"{path}: {what}; {REMEDY}", field=path.name)

@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Float32, Int64
 from numpy.typing import NDArray
 
-from service.errors import BundleError
+from service.errors import damaged_file
 from service.maps import index
 from service.maps.index import Rows, Shortlister, vectors_of
 
@@ -48,7 +48,6 @@ _QUERIES, _LISTED, _BEST = 128, 1_440, 10
 _NOISE = 0.6
 #: Recall to reach, and factor by which the number of lists that a search reads grows until then.
 _WANTED, _GROWTH = 0.992, 2**0.5
-_REMEDY = "copy or build the bundle again"
 _QueryDescriptors = Float32[NDArray[np.float32], "q D"]
 #: FAISS without its type stubs, which lack many of the classes and fields that this file uses.
 _faiss: Any = faiss
@@ -114,12 +113,12 @@ class InvertedFile:
             whole = _faiss.read_index(str(path), _faiss.IO_FLAG_MMAP | _faiss.IO_FLAG_READ_ONLY)
         except RuntimeError as error:
             reason = str(error).splitlines()[0].rpartition("Error: ")[2]
-            raise _defect(path, f"not a valid FAISS index ({reason})") from error
+            raise damaged_file(path, f"not a valid FAISS index ({reason})") from error
         wrong = _unlike(whole, views, dimension, path.stat().st_size)
         if not wrong and verify:
             wrong = _inconsistent(_faiss.downcast_index(whole.index))
         if wrong:
-            raise _defect(path, wrong)
+            raise damaged_file(path, wrong)
         # FAISS would start 32 threads for each search, which read the lists in advance (2 ms).
         _faiss.downcast_InvertedLists(_faiss.downcast_index(whole.index).invlists).prefetch_nthread = 0
         return cls(whole, headings)
@@ -330,7 +329,3 @@ def _inconsistent(inverted: Any) -> str:
     if len(neighbours) and not -1 <= neighbours.min() <= neighbours.max() < inverted.nlist:
         return "the graph refers to a missing centroid"
     return ""
-
-
-def _defect(path: Path, what: str) -> BundleError:
-    return BundleError(f"{path}: {what}; {_REMEDY}", field=FILE)

@@ -18,9 +18,8 @@ import numpy as np
 from jaxtyping import Float32, Int64
 from numpy.typing import NDArray
 
-from service.errors import BundleError, SearchError, extra_missing
+from service.errors import BundleError, SearchError, damaged_file, extra_missing
 from service.maps import index
-from service.maps.files import defect
 from service.maps.index import Rows, read_descriptors
 from service.maps.manifest import FILE, Manifest, Tile, read_manifest
 from service.maps.search_address import COLLECTION, checked_name, checked_search_url
@@ -374,12 +373,14 @@ def _descriptors_of(folder: Path, tile: Tile) -> Rows:
     place = folder / tile.folder
     read, path = read_manifest(place), place / index.FILE
     if read.version != tile.version:
-        raise defect(place / FILE, f"version {read.version}, but the map lists {tile.version}")
+        raise damaged_file(place / FILE, f"version {read.version}, but the map lists {tile.version}")
     numbers = read_descriptors(path)
     if index.FILE not in read.files or sha256_of(path) != read.files[index.FILE].sha256:
-        raise defect(path, "the hash does not match the manifest")
+        raise damaged_file(path, "the hash does not match the manifest")
     if numbers.shape != (tile.counts.views, tile.counts.descriptor_size):
-        raise defect(path, f"shape {numbers.shape} instead of ({tile.counts.views}, {tile.counts.descriptor_size})")
+        raise damaged_file(
+            path, f"shape {numbers.shape} instead of ({tile.counts.views}, {tile.counts.descriptor_size})"
+        )
     return numbers
 
 

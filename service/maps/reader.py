@@ -5,11 +5,11 @@ from pathlib import Path
 
 import numpy as np
 
-from service.errors import BundleError
+from service.errors import BundleError, damaged_file
 from service.maps import content as parts
 from service.maps import index, inverted_file, streets
 from service.maps.calibration import read_calibration
-from service.maps.files import defect, json_object, map_array, read_file, require_files
+from service.maps.files import json_object, map_array, read_file, require_files
 from service.maps.index import ScannedCopy, Shortlister, ViewIndex
 from service.maps.inverted_file import InvertedFile
 from service.maps.manifest import FILE, TILES_FOLDER, Manifest, read_manifest
@@ -17,7 +17,8 @@ from service.maps.map import Map
 from service.maps.streets import Streets
 from service.registration.surfel_map import SurfelMap
 
-_NEEDED = (parts.ENCODER_FILE, index.FILE, parts.PLACES_FILE, parts.VIEWS_FILE, parts.CALIBRATION_FILE)
+#: Files that every bundle has, apart from the arrays of its cloud.
+NEEDED = (parts.ENCODER_FILE, index.FILE, parts.PLACES_FILE, parts.VIEWS_FILE, parts.CALIBRATION_FILE)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -51,7 +52,7 @@ class MapBundle(Map):
                 "or build the map without --tile-m",
                 field=FILE,
             )
-        require_files(path, manifest, _NEEDED, verify=verify and compare_hashes)
+        require_files(path, manifest, NEEDED, verify=verify and compare_hashes)
         document = read_file(path / streets.FILE) if streets.FILE in manifest.files else None
         bundle = cls(
             path=path,
@@ -113,19 +114,21 @@ def _require_consistent(bundle: MapBundle) -> None:
     }
     for name, (has, expected, what) in found.items():
         if has != expected:
-            raise defect(path / name, f"{has} {what} instead of {expected}")
+            raise damaged_file(path / name, f"{has} {what} instead of {expected}")
     if bundle.view_index.dimension != counts.descriptor_size:
-        raise defect(
+        raise damaged_file(
             path / index.FILE,
             f"descriptors of {bundle.view_index.dimension} numbers instead of {counts.descriptor_size}",
         )
     if bundle.view_place.min() < 0 or bundle.view_place.max() >= counts.places:
-        raise defect(path / parts.VIEWS_FILE, "a view refers to a missing place")
+        raise damaged_file(path / parts.VIEWS_FILE, "a view refers to a missing place")
     if bundle.place_street.min() < -1 or bundle.place_street.max() >= streets_found:
-        raise defect(path / parts.PLACES_FILE, "a place refers to a missing street")
+        raise damaged_file(path / parts.PLACES_FILE, "a place refers to a missing street")
     if not np.array_equal(bundle.view_place, np.repeat(np.arange(counts.places), bundle.manifest.headings)):
-        raise defect(path / parts.VIEWS_FILE, "the views are not sorted by place, with all headings of each place")
+        raise damaged_file(
+            path / parts.VIEWS_FILE, "the views are not sorted by place, with all headings of each place"
+        )
     if not np.isfinite(bundle.view_heading_rad).all():
-        raise defect(path / parts.VIEWS_FILE, "a heading is not finite")
+        raise damaged_file(path / parts.VIEWS_FILE, "a heading is not finite")
     if not parts.are_poses(bundle.T_map_place):
-        raise defect(path / parts.PLACES_FILE, parts.NO_POSE)
+        raise damaged_file(path / parts.PLACES_FILE, parts.NO_POSE)

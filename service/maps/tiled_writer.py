@@ -15,12 +15,11 @@ from service.maps.calibration import Calibration, RigCorrection, Site, read_cali
 from service.maps.files import json_object, read_file, require_files
 from service.maps.joined_index import JoinedRows
 from service.maps.manifest import TILES_FOLDER, Counts, FileEntry, Manifest, Tile, read_manifest
-from service.maps.reader import MapBundle
+from service.maps.reader import NEEDED, MapBundle
 from service.maps.streets import Streets
 from service.maps.tiles import MOST_SEARCHED, differences, places_in_map, street_numbers
 from service.maps.writer import in_place, json_bytes, link_or_copy, sha256_of, sync
 
-_NEEDED = (parts.ENCODER_FILE, index.FILE, parts.PLACES_FILE, parts.VIEWS_FILE, parts.CALIBRATION_FILE)
 #: Parameters of which the map states the largest of all tiles.
 LARGEST = ("survey_position_std_m", "survey_angle_std_deg", "surveyed_height_m")
 _REMEDY = "build all tiles with the same encoder and settings"
@@ -76,7 +75,7 @@ def _opened(folder: Path) -> Manifest:
     read = read_manifest(folder)
     if read.tiles:
         raise BundleError(f"{folder}: a tiled map cannot be a tile; give its tiles", field="tiles")
-    require_files(folder, read, _NEEDED, verify=False)
+    require_files(folder, read, NEEDED, verify=False)
     return read
 
 

@@ -15,11 +15,11 @@ import numpy as np
 from jaxtyping import Float32, Float64, Int32, Int64
 from numpy.typing import NDArray
 
-from service.errors import BundleError
+from service.errors import BundleError, damaged_file
 from service.maps import content as parts
 from service.maps import inverted_file, manifest, streets
 from service.maps.calibration import read_calibration
-from service.maps.files import defect, json_object, map_array, read_file, require_files
+from service.maps.files import json_object, map_array, read_file, require_files
 from service.maps.index import Shortlister, ViewIndex
 from service.maps.inverted_file import InvertedFile
 from service.maps.joined_index import JoinedRows, JoinedShortlists
@@ -313,7 +313,7 @@ class OpenTiles:
         def cloud_of(row: int) -> SurfelMap:
             cloud = (self.get(numbers[row]) if opened is None else opened[row]).cloud
             if not isinstance(cloud, SurfelMap):
-                raise defect(self._path / self._manifest.tiles[numbers[row]].folder, "the tile has no cloud")
+                raise damaged_file(self._path / self._manifest.tiles[numbers[row]].folder, "the tile has no cloud")
             return cloud
 
         has_brightness = opened is not None and all(
@@ -357,15 +357,17 @@ class OpenTiles:
     def _opened_from(self, folder: Path, tile: Tile, *, verify: bool) -> MapBundle:
         bundle = MapBundle.open(folder, verify=verify, compare_hashes=not self._source.is_compared(tile))
         if bundle.manifest.version != tile.version:
-            raise defect(folder / manifest.FILE, f"version {bundle.manifest.version}, but the map lists {tile.version}")
+            raise damaged_file(
+                folder / manifest.FILE, f"version {bundle.manifest.version}, but the map lists {tile.version}"
+            )
         if different := differences(bundle.manifest, self._manifest):
-            raise defect(folder / manifest.FILE, f"{different[0]} differs from the map")
+            raise damaged_file(folder / manifest.FILE, f"{different[0]} differs from the map")
         if bundle.manifest.counts != tile.counts:
-            raise defect(folder / manifest.FILE, "the counts are not those that the map lists")
+            raise damaged_file(folder / manifest.FILE, "the counts are not those that the map lists")
         try:
             places = places_in_map(bundle, self._street_number, self._manifest.lidar_height_m)
         except KeyError as error:
-            raise defect(folder / streets.FILE, f"the map has no street {error.args[0]!r}") from error
+            raise damaged_file(folder / streets.FILE, f"the map has no street {error.args[0]!r}") from error
         return replace(bundle, places=places)
 
 
@@ -613,7 +615,7 @@ def _search(path: Path, read: Manifest, open_search: OpenSearch | None, *, verif
             verify=verify,
         )
     if len(read.tiles) > MOST_SEARCHED:
-        raise defect(path / inverted_file.FILE, f"missing, but a map of more than {MOST_SEARCHED} tiles needs it")
+        raise damaged_file(path / inverted_file.FILE, f"missing, but a map of more than {MOST_SEARCHED} tiles needs it")
     return None
 
 
@@ -621,12 +623,12 @@ def _require_consistent(opened: TiledMap) -> None:
     counts, path = opened.manifest.counts, opened.path
     named = 0 if opened.streets is None else len(opened.streets)
     if len(opened.places) != counts.places:
-        raise defect(path / parts.PLACES_FILE, f"{len(opened.places)} places instead of {counts.places}")
+        raise damaged_file(path / parts.PLACES_FILE, f"{len(opened.places)} places instead of {counts.places}")
     if named != counts.streets:
-        raise defect(path / streets.FILE, f"{named} streets instead of {counts.streets}")
+        raise damaged_file(path / streets.FILE, f"{named} streets instead of {counts.streets}")
     if not parts.are_poses(opened.T_map_place):
-        raise defect(path / parts.PLACES_FILE, parts.NO_POSE)
+        raise damaged_file(path / parts.PLACES_FILE, parts.NO_POSE)
     if opened.place_street.min() < -1 or opened.place_street.max() >= named:
-        raise defect(path / parts.PLACES_FILE, "a place refers to a missing street")
+        raise damaged_file(path / parts.PLACES_FILE, "a place refers to a missing street")
     if counts.views != counts.places * opened.manifest.headings:
-        raise defect(path / manifest.FILE, "the number of views differs from places times headings")
+        raise damaged_file(path / manifest.FILE, "the number of views differs from places times headings")

@@ -34,6 +34,8 @@ KEY_BITS = 18
 _CHUNK = 1 << 18
 #: Points in a batch of the kernel. Arrays of points are padded to whole batches.
 BATCH_SIZE = 32
+#: Standard deviation of a point's distance to its surface in the score of a pose, m, apart from its noise.
+TOLERANCE_M = 0.1
 LIBRARY = Path(__file__).with_name("_kernel.so")
 
 #: A surfel: position (m, surfels' frame), unit normal, thickness across the surface (m), number of survey points.
@@ -372,7 +374,7 @@ def align(
     states: NDArray[Any],
     options: SolverOptions,
     *,
-    tolerance_m: float = 0.1,
+    tolerance_m: float = TOLERANCE_M,
     height_min_m: float = -1e9,
 ) -> None:
     """Register every start on the map in place, then score it.

@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from service.compiled import load
 from service.geometry.camera import PinholeCamera
 from service.geometry.rigid import Rotation
+from service.imaging.view_grid import MAX_RANGE_M
 from service.registration.kernel import QueryPoints
 
 LIBRARY = Path(__file__).with_name("_points.so")
@@ -37,6 +38,8 @@ LEAST_NOISE = 1e-6
 MATCHING_PX = 0.5
 #: Focal length (px) times baseline (m) of the stereo camera that is assumed where none is known. Simulation and training model it too.
 FOCAL_BASELINE_PX_M = 80.0
+#: Points lower than ``GROUND_M`` above the ground (m) are ground points. Vehicles and people are lower than ``MOVABLE_M``.
+GROUND_M, MOVABLE_M = 0.3, 2.0
 
 
 class _Blocks(Structure):
@@ -75,11 +78,11 @@ class PointSettings:
     columns: int = 128
     points: int = 3000
     ground_share: float = 0.25
-    ground_m: float = 0.3
+    ground_m: float = GROUND_M
     edge: float = 0.12
     floor_m: float = 0.02
-    reach_m: float = 40.0
-    movable_m: float = 2.0
+    reach_m: float = MAX_RANGE_M
+    movable_m: float = MOVABLE_M
     movable_weight: float = 0.1
 
     def __post_init__(self) -> None:

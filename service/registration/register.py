@@ -11,7 +11,8 @@ from jaxtyping import Float64
 from numpy.typing import NDArray
 
 from service.geometry.rigid import Rotation, Transform, rotation_z, transform_from
-from service.registration.kernel import STATE, QueryPoints, SolverOptions
+from service.registration.kernel import STATE, TOLERANCE_M, QueryPoints, SolverOptions
+from service.registration.points import GROUND_M
 from service.registration.surfel_tiles import Cloud
 
 
@@ -85,8 +86,8 @@ class RegistrationSettings:
     fine: SolverOptions = field(
         default_factory=lambda: SolverOptions(iterations=8, reach=1.2, robust_first=0.25, robust_last=0.06)
     )
-    tolerance_m: float = 0.1
-    ground_m: float = 0.3
+    tolerance_m: float = TOLERANCE_M
+    ground_m: float = GROUND_M
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -16,6 +16,7 @@ from service.registration.kernel import (
     GRID_BLOCK,
     GRID_REGION,
     PACKED_SURFEL,
+    TOLERANCE_M,
     NearestGrid,
     QueryPoints,
     SolverOptions,
@@ -122,7 +123,7 @@ class SurfelMap:
         states: NDArray[Any],
         options: SolverOptions,
         *,
-        tolerance_m: float = 0.1,
+        tolerance_m: float = TOLERANCE_M,
         height_min_m: float = -1e9,
     ) -> None:
         """Register every start on this cloud, in place, then score it (``kernel.align``).

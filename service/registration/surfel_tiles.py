@@ -8,8 +8,11 @@ import numpy as np
 from jaxtyping import Float64, Int64
 from numpy.typing import NDArray
 
-from service.registration.kernel import QueryPoints, SolverOptions
+from service.registration.kernel import TOLERANCE_M, QueryPoints, SolverOptions
 from service.registration.surfel_map import SurfelMap
+
+#: Largest number of tiles of a tiled map that a picture shows, evenly chosen. Each one is read from the disk.
+DRAWN_TILES = 64
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -53,7 +56,7 @@ class SurfelTiles:
         states: NDArray[Any],
         options: SolverOptions,
         *,
-        tolerance_m: float = 0.1,
+        tolerance_m: float = TOLERANCE_M,
         height_min_m: float = -1e9,
     ) -> None:
         """Register every start on the cloud of its tile, in place, as ``SurfelMap.align``.

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from service.compiled import load
 from service.geometry.camera import PinholeCamera
 from service.geometry.rigid import Transform
+from service.imaging.view_grid import MAX_RANGE_M
 from service.registration.kernel import CUBE, PACKED_SURFEL, SURFEL
 from service.registration.surfel_map import SurfelMap
 from service.registration.surfel_tiles import Cloud
@@ -48,7 +49,7 @@ class DiscSettings:
     same_surface_m: float = 0.3
     grazing: float = 0.05
     nearest_m: float = 0.5
-    reach_m: float = 40.0
+    reach_m: float = MAX_RANGE_M
 
 
 #: Work memory for one surfel in the camera's axes: position, normal, index, and the range of pixels that it may cover.

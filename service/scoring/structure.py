@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from service.geometry.camera import PinholeCamera
 from service.geometry.rigid import Rotation, transform_from
 from service.registration.kernel import render
-from service.registration.points import DepthBlocks
+from service.registration.points import GROUND_M, MOVABLE_M, DepthBlocks
 from service.registration.register import Registered
 from service.registration.surfel_tiles import Cloud
 from service.scoring.measured import MeasuredFrame
@@ -24,8 +24,8 @@ from service.scoring.scorer import Scores
 
 #: Camera of the comparison, the same for all rigs: 40 px per radian at the centre, 109 by 70 degrees.
 CAMERA = PinholeCamera(112, 56, 40.0, 40.0, 55.5, 27.5)
-#: Points higher than this above the ground (m) are no ground; those higher than ``UPPER_M`` are no vehicles or people either.
-GROUND_M, UPPER_M = 0.3, 2.0
+#: Points higher than this above the ground (m) are no vehicles or people.
+UPPER_M = MOVABLE_M
 #: Relative difference of the depths of two neighbouring pixels at a depth edge.
 JUMP = 0.25
 #: Standard deviation of the surfaces of the map and of a pixel's place on them, m. It adds to that of the depth.

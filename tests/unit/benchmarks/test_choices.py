@@ -8,9 +8,9 @@ pytest.importorskip("torch", reason="needs the extra `training`")
 from benchmarks.choices.__main__ import _nearest_to_fixed, _vote
 from benchmarks.choices.registration import POINTS
 from benchmarks.choices.trainings import VARIATIONS
-from benchmarks.choices.watch import Seen, watch_plan
+from benchmarks.choices.validation_city import Seen, validation_plan
 from model_training.training.loop import TrainingConfig
-from model_training.training.recipe import WATCH_SEEDS
+from model_training.training.recipe import VALIDATION_SEEDS
 from service.scoring import measured
 
 
@@ -50,8 +50,8 @@ def test_variations_differ_from_the_reference_in_one_thing_and_are_configuration
         assert set(variation.blind) <= {"range_m", "v1", "v2", "height_m", "observed", "brightness"}
 
 
-def test_choices_are_measured_in_a_watch_city():
-    assert watch_plan().seed in WATCH_SEEDS
+def test_choices_are_measured_in_a_validation_city():
+    assert validation_plan().seed in VALIDATION_SEEDS
 
 
 def test_each_ablation_of_registration_replaces_a_function_that_it_calls():

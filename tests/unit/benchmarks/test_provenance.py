@@ -68,6 +68,26 @@ def test_a_stale_mark_is_removed_from_a_row_that_is_measured_again(repository):
     assert "stale" not in row
 
 
+def test_a_check_that_answers_are_equal_connects_two_versions(repository, tmp_path, monkeypatch):
+    """Rows of the first version stay valid over checked changes. Other rows, and later changes, are stale as before."""
+    (first, second, third), commit = repository
+    checks = tmp_path / "checks.json"
+    monkeypatch.setattr(provenance, "CHECKS", checks)
+    fourth = commit("service/maps/a.py", "4")
+    covered = {"mine": ["map."]}
+
+    def checked(*pairs):
+        checks.write_text(json.dumps([{"before": one, "after": other, "covered": covered} for one, other in pairs]))
+        return ages([first], fourth, "map.a", "other")
+
+    assert checked((first, second)) == [True, True]  # the change after the check is not compared
+    assert checked((third, fourth)) == [True, True]  # nor is the one before it
+    assert checked((first, second), (third, fourth)) == ["same answers", True]
+    assert checked((first, fourth)) == ["same answers", True]
+    covered["mine"], covered["another"] = ["all."], ["map."]
+    assert checked((first, fourth)) == [True, True]
+
+
 def test_without_git_the_age_is_unknown(repository, tmp_path, monkeypatch):
     (first, _, third), _ = repository
     assert ages(["0" * 40], third, "map") == ["unknown"]

@@ -76,10 +76,13 @@ def test_every_run_is_listed_with_its_machine_and_its_rows_and_every_row_names_i
 
 
 def test_stale_rows_are_marked_and_counted():
-    lines = section({"id": "a", "stale": True}, {"id": "b", "stale": "unknown"}, {"id": "c"})
+    lines = section(
+        {"id": "a", "stale": True}, {"id": "b", "stale": "unknown"}, {"id": "c"}, {"id": "d", "stale": "same answers"}
+    )
     marks = {line.split("|")[1].strip(): line.split("|")[-2].strip() for line in lines if line.startswith("| `")}
-    assert marks == {"`a`": "**stale**", "`b`": "age unknown", "`c`": ""}
-    assert "Of 3 rows 1 are stale and 1 of unknown age, as of commit `ffffffffff`." in lines
+    assert marks == {"`a`": "**stale**", "`b`": "age unknown", "`c`": "", "`d`": "same answers"}
+    assert any(line.startswith("1 rows have the same answers") for line in lines)
+    assert "Of 4 rows 1 are stale and 1 of unknown age, as of commit `ffffffffff`." in lines
 
 
 def test_a_reason_for_another_value_is_not_shown():

@@ -3,7 +3,7 @@ import pytest
 
 from benchmarks import rigs
 from benchmarks.report import Report
-from model_training.calibration.fit import Asked, pooled
+from model_training.calibration.fit import CalibrationData, pooled
 from service.confidence.features import FEATURES
 
 COUNT, MARGIN, SHARE = len(FEATURES), FEATURES.index("margin"), FEATURES.index("log_share")
@@ -17,7 +17,7 @@ def family(name, seed, *, count=1000):
     evidence[:, MARGIN] += np.where(known, 4.0, -4.0)
     evidence[:, SHARE] = 0.0
     error = np.where(known[:, None], 0.1 * rng.normal(size=(count, 6)), np.nan)
-    return Asked(
+    return CalibrationData(
         evidence=evidence,
         right=known,
         known=known,
@@ -31,8 +31,8 @@ def family(name, seed, *, count=1000):
 
 @pytest.fixture
 def rows(monkeypatch, tmp_path, encoder_file):
-    asked = pooled([family("car", 1), family("rings", 2), family("robot", 3)])
-    monkeypatch.setattr(rigs, "collected", lambda *_, **__: asked)
+    data = pooled([family("car", 1), family("rings", 2), family("robot", 3)])
+    monkeypatch.setattr(rigs, "collected", lambda *_, **__: data)
     report = Report("accuracy", "make evaluate")
     rigs.rig_rows(report, encoder_file, tmp_path)
     return {row["id"]: row for row in report.rows}

@@ -5,7 +5,13 @@ import numpy as np
 import pytest
 
 from model_training.calibration import collect
-from model_training.calibration.collect import asked_of, in_the_map, of_another_city, preset_of, walls_and_rooms
+from model_training.calibration.collect import (
+    calibration_data_of,
+    in_the_map,
+    of_another_city,
+    preset_of,
+    walls_and_rooms,
+)
 from model_training.calibration.rigs import RIGS
 from model_training.evaluation.predict import RANKED, Predictions
 from model_training.simulation.depth_noise import DEPTHS
@@ -38,7 +44,7 @@ def predictions(errors_m, *, up_m=0.0):
 
 
 def test_an_answer_within_a_metre_on_the_ground_is_right():
-    found = asked_of(predictions([0.0, 0.99, 1.01, 50.0, np.nan], up_m=3.0), "clear_precise", known=True)
+    found = calibration_data_of(predictions([0.0, 0.99, 1.01, 50.0, np.nan], up_m=3.0), "clear_precise", known=True)
     assert found.right.tolist() == [True, True, False, False, False]
     assert found.known.all()
     assert set(found.kind.tolist()) == {"clear_precise"}
@@ -47,7 +53,7 @@ def test_an_answer_within_a_metre_on_the_ground_is_right():
 
 def test_calibration_data_hold_the_error_and_the_heading_of_a_known_query():
     """0.6 of the error is along x, 0.8 along y. The optical axis of an identity pose points up, so its heading is any finite number."""
-    found = asked_of(predictions([0.5, np.nan], up_m=3.0), "drive1_sgbm", known=True)
+    found = calibration_data_of(predictions([0.5, np.nan], up_m=3.0), "drive1_sgbm", known=True)
     np.testing.assert_allclose(found.error[0], [0.3, 0.4, 3.0, 0, 0, 0], atol=1e-12)
     assert np.isnan(found.error[1, :2]).all()
     assert np.isfinite(found.heading_rad).all()
@@ -55,7 +61,7 @@ def test_calibration_data_hold_the_error_and_the_heading_of_a_known_query():
 
 
 def test_outside_the_map_no_answer_is_right():
-    found = asked_of(predictions([0.0, 50.0]), "other_city.precise", known=False)
+    found = calibration_data_of(predictions([0.0, 50.0]), "other_city.precise", known=False)
     assert not found.right.any()
     assert not found.known.any()
     assert np.isnan(found.error).all()
@@ -165,7 +171,7 @@ def test_walls_and_rooms_are_nowhere_and_told_by_kind_and_preset():
     for part, each in enumerate(found):
         rows = each.evidence[:, 0]
         np.testing.assert_array_equal(rows, [4 * part, np.nan, 4 * part + 2, np.nan])
-    assert told[3] == ("strangers wall_precise", 4, 4)
+    assert told[3] == ("walls and rooms wall_precise", 4, 4)
     assert len(told) == len(localizer.asked) == 16
 
 

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from model_training.calibration.cross_check import FamilyFigures, accepted, cross_check, table
-from model_training.calibration.fit import Asked, confidences, fit, pooled
+from model_training.calibration.fit import CalibrationData, confidences, fit, pooled
 from service.confidence.features import FEATURES
 
 COUNT, MARGIN, SHARE = len(FEATURES), FEATURES.index("margin"), FEATURES.index("log_share")
@@ -16,7 +16,7 @@ def family(name, seed, *, upside_down=False, count=2000):
     evidence = rng.normal(size=(count, COUNT))
     evidence[:, MARGIN] += np.where(right, 3.0, -3.0) * (-1 if upside_down else 1)
     evidence[:, SHARE] = 0.0
-    return Asked(
+    return CalibrationData(
         evidence=evidence,
         right=right,
         known=known,
@@ -50,9 +50,9 @@ def test_a_family_is_not_predicted_from_itself(figures):
 
 
 def test_the_status_needs_the_threshold_the_majority_and_a_query_in_range():
-    asked = family("one", 1)
-    calibration = fit(asked, measured_on={})
-    four = asked.where(np.arange(len(asked)) < 4)
+    data = family("one", 1)
+    calibration = fit(data, measured_on={})
+    four = data.where(np.arange(len(data)) < 4)
     four.evidence[:] = 0.0
     four.evidence[:, SHARE] = np.log([0.9, 0.4, 0.9, 0.9])
     four.evidence[3, FEATURES.index("points")] = 1e6

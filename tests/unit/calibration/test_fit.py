@@ -7,7 +7,7 @@ from model_training.calibration import fit as fitting
 from model_training.calibration.additive import Penalty
 from model_training.calibration.fit import (
     RATES,
-    Asked,
+    CalibrationData,
     confidences,
     expected_calibration_error,
     fit,
@@ -32,10 +32,10 @@ def evidence_of(rng, count):
     return MEAN + SPREAD * rng.uniform(-np.sqrt(3), np.sqrt(3), (count, COUNT))
 
 
-def asked_of(evidence, right, known, kind=None, family="any"):
+def calibration_data_of(evidence, right, known, kind=None, family="any"):
     kind = np.where(known, "clear", "other_city") if kind is None else np.array(kind)
     count = len(evidence)
-    return Asked(
+    return CalibrationData(
         evidence=evidence,
         right=np.array(right, bool),
         known=np.array(known, bool),
@@ -48,19 +48,19 @@ def asked_of(evidence, right, known, kind=None, family="any"):
 
 
 @pytest.fixture(scope="module")
-def asked():
+def data():
     """As many known as not, by the inliers; right by the margin and the inliers."""
     rng = np.random.default_rng(1)
     evidence = evidence_of(rng, 30_000)
     z = (evidence - MEAN) / SPREAD
     right = rng.random(len(z)) < probability(0.5 + 1.5 * z[:, MARGIN] + 0.8 * z[:, INLIERS])
     known = rng.random(len(z)) < probability(1.2 * z[:, INLIERS])
-    return asked_of(evidence, right, known)
+    return calibration_data_of(evidence, right, known)
 
 
 @pytest.fixture(scope="module")
-def calibration(asked):
-    return fit(asked, measured_on={})
+def calibration(data):
+    return fit(data, measured_on={})
 
 
 @pytest.fixture(scope="module")
@@ -73,26 +73,26 @@ def few():
     evidence[rng.random(2000) < 0.1, 3:] = np.nan
     kind = np.where(known, "clear", np.where(rng.random(2000) < 0.3, "other_city", "removed_streets"))
     evidence[kind == "removed_streets", MARGIN] += 1.0  # more like a place in the map than another city is
-    return asked_of(evidence, right, known, kind)
+    return calibration_data_of(evidence, right, known, kind)
 
 
-def test_true_probabilities_are_recovered(asked, calibration):
+def test_true_probabilities_are_recovered(data, calibration):
     """Both halves have nearly the same number of queries, so the weights change little."""
-    z = (asked.evidence - MEAN) / SPREAD
+    z = (data.evidence - MEAN) / SPREAD
     true = probability(0.5 + 1.5 * z[:, MARGIN] + 0.8 * z[:, INLIERS])
-    error = calibration.confidence(asked.evidence) - true
+    error = calibration.confidence(data.evidence) - true
     assert np.abs(error).mean() < 0.02
     assert np.quantile(np.abs(error), 0.99) < 0.08
 
 
-def test_whether_the_query_is_in_the_map_does_not_depend_on_competing_candidates(asked, calibration):
+def test_whether_the_query_is_in_the_map_does_not_depend_on_competing_candidates(data, calibration):
     used = {term.feature for term in calibration.known.terms}
     assert "mapped_inliers" in used
     assert not used & {*RIVALRY, *UNWEIGHED}
-    rivals_differ = asked.evidence[:9].copy()
+    rivals_differ = data.evidence[:9].copy()
     rivals_differ[:, [FEATURES.index(name) for name in RIVALRY]] = 1e3
     np.testing.assert_array_equal(
-        calibration.log_odds("known", rivals_differ), calibration.log_odds("known", asked.evidence[:9])
+        calibration.log_odds("known", rivals_differ), calibration.log_odds("known", data.evidence[:9])
     )
 
 
@@ -102,21 +102,21 @@ def test_the_confidence_uses_no_unweighted_feature(calibration):
     assert not used & set(UNWEIGHED)
 
 
-def test_the_file_states_mean_and_standard_deviation_of_each_feature(asked, calibration):
-    np.testing.assert_allclose([each.mean for each in calibration.features], asked.evidence.mean(axis=0))
-    np.testing.assert_allclose([each.std for each in calibration.features], asked.evidence.std(axis=0), rtol=1e-6)
+def test_the_file_states_mean_and_standard_deviation_of_each_feature(data, calibration):
+    np.testing.assert_allclose([each.mean for each in calibration.features], data.evidence.mean(axis=0))
+    np.testing.assert_allclose([each.std for each in calibration.features], data.evidence.std(axis=0), rtol=1e-6)
 
 
 def test_weights_by_hand():
     """Two families; the map and its outside weigh the same in each. Four rows in four groups of 1, 3, 2 and 2."""
     known = [1, 0, 0, 0, 1, 1, 0, 0]
-    asked = asked_of(np.zeros((8, COUNT)), np.zeros(8), known, family=["a"] * 4 + ["b"] * 4)
-    np.testing.assert_allclose(weights_of(asked), [2, 2 / 3, 2 / 3, 2 / 3, 1, 1, 1, 1])
+    data = calibration_data_of(np.zeros((8, COUNT)), np.zeros(8), known, family=["a"] * 4 + ["b"] * 4)
+    np.testing.assert_allclose(weights_of(data), [2, 2 / 3, 2 / 3, 2 / 3, 1, 1, 1, 1])
 
 
 def test_a_family_without_out_of_map_queries_has_half_a_weight():
-    asked = asked_of(np.zeros((6, COUNT)), np.zeros(6), [1, 1, 0, 0, 1, 1], family=["a"] * 4 + ["b"] * 2)
-    np.testing.assert_allclose(weights_of(asked), 1.0)
+    data = calibration_data_of(np.zeros((6, COUNT)), np.zeros(6), [1, 1, 0, 0, 1, 1], family=["a"] * 4 + ["b"] * 2)
+    np.testing.assert_allclose(weights_of(data), 1.0)
 
 
 def test_queries_in_the_map_and_outside_it_weigh_the_same_whatever_their_numbers(few):
@@ -132,9 +132,9 @@ def test_what_tells_nothing_leaves_the_share_that_is_right():
     """A third of the known are right and none of the others, and both weigh the same: one in six."""
     rng = np.random.default_rng(2)
     evidence, known = evidence_of(rng, 6000), np.arange(6000) % 4 > 0
-    asked = asked_of(evidence, known & (np.arange(6000) % 9 < 3), known)
-    found = fit(asked, measured_on={}, ridge=1e6).confidence(evidence)
-    share = 0.5 * asked.right[known].mean()
+    data = calibration_data_of(evidence, known & (np.arange(6000) % 9 < 3), known)
+    found = fit(data, measured_on={}, ridge=1e6).confidence(evidence)
+    share = 0.5 * data.right[known].mean()
     np.testing.assert_allclose(found, share, atol=0.005)
     assert share == pytest.approx(1 / 6, abs=0.005)
 
@@ -143,7 +143,7 @@ def test_what_a_feature_tells_without_fail_still_gives_finite_weights():
     rng = np.random.default_rng(3)
     evidence = evidence_of(rng, 400)
     sure = evidence[:, MARGIN] > MEAN
-    calibration = fit(asked_of(evidence, sure, sure), measured_on={})
+    calibration = fit(calibration_data_of(evidence, sure, sure), measured_on={})
     assert all(np.isfinite(term.log_odds).all() for term in calibration.right.terms)
     assert ((calibration.confidence(evidence) > 0.5) == sure).mean() > 0.97
 
@@ -151,10 +151,10 @@ def test_what_a_feature_tells_without_fail_still_gives_finite_weights():
 def test_a_feature_that_never_changes_does_no_harm(few):
     evidence = few.evidence.copy()
     evidence[:, FEATURES.index("scale")] = 0.3
-    asked = asked_of(evidence, few.right, few.known, few.kind)
-    found = fit(asked, measured_on={}).confidence(asked.registered().evidence)
+    data = calibration_data_of(evidence, few.right, few.known, few.kind)
+    found = fit(data, measured_on={}).confidence(data.registered().evidence)
     assert np.isfinite(found).all()
-    assert expected_calibration_error(found, asked.registered().right) < 0.1
+    assert expected_calibration_error(found, data.registered().right) < 0.1
 
 
 def test_confidence_is_0_without_registration(few, calibration):
@@ -170,25 +170,27 @@ def test_a_threshold_does_not_see_the_own_fit_of_a_family():
     evidence = evidence_of(rng, 4000)
     high, second = evidence[:, MARGIN] > MEAN, np.arange(4000) >= 2000
     right = high ^ second
-    asked = asked_of(evidence, right, right, family=np.where(second, "two", "one"))
-    found = held_out_confidences(asked, TABLE, Penalty(1.0, 1.0))
+    data = calibration_data_of(evidence, right, right, family=np.where(second, "two", "one"))
+    found = held_out_confidences(data, TABLE, Penalty(1.0, 1.0))
     assert found[second & high].mean() > 0.9
     assert found[second & ~high].mean() < 0.1
-    asked.evidence[7] = np.nan
-    assert held_out_confidences(asked, TABLE, Penalty(1.0, 1.0))[7] == 0
+    data.evidence[7] = np.nan
+    assert held_out_confidences(data, TABLE, Penalty(1.0, 1.0))[7] == 0
 
 
 def outside(confidence, kind):
     """Out-of-map queries with these confidences."""
     count = len(confidence)
-    return asked_of(np.zeros((count, COUNT)), np.zeros(count), np.zeros(count), kind), np.array(confidence, float)
+    return calibration_data_of(np.zeros((count, COUNT)), np.zeros(count), np.zeros(count), kind), np.array(
+        confidence, float
+    )
 
 
 def test_thresholds_by_hand(monkeypatch):
     """100 queries of one kind. Up to 5 % may be accepted, so 1 is accepted: the bound of 1 of 100 is 4.7 %, of 2 of 100 it is 6.2 %."""
     monkeypatch.setattr(fitting, "RATES", (0.05, 0.07))
-    asked, confidence = outside(np.arange(100) / 100, ["a"] * 100)
-    first, second = thresholds_of(asked, confidence)
+    data, confidence = outside(np.arange(100) / 100, ["a"] * 100)
+    first, second = thresholds_of(data, confidence)
     assert first.false_accept_rate == 0.05
     assert 0.98 < first.confidence < 0.98 + 1e-12
     assert 0.97 < second.confidence < 0.97 + 1e-12
@@ -278,7 +280,7 @@ def test_what_was_fitted_can_be_written_and_read(few):
 def test_only_queries_with_all_their_evidence_are_registered():
     evidence = np.ones((4, COUNT))
     evidence[1, 3], evidence[2] = np.nan, np.inf
-    found = asked_of(evidence, [1, 1, 1, 0], [1, 1, 1, 0], ["a", "b", "c", "d"]).registered()
+    found = calibration_data_of(evidence, [1, 1, 1, 0], [1, 1, 1, 0], ["a", "b", "c", "d"]).registered()
     assert (found.right.tolist(), found.known.tolist(), found.kind.tolist()) == (
         [True, False],
         [True, False],
@@ -289,8 +291,8 @@ def test_only_queries_with_all_their_evidence_are_registered():
 
 def test_pooled_queries_keep_their_order_and_their_kinds():
     one, other = (
-        asked_of(np.zeros((2, COUNT)), [1, 0], [1, 1], ["a", "b"]),
-        asked_of(np.ones((1, COUNT)), [0], [0], ["longer"]),
+        calibration_data_of(np.zeros((2, COUNT)), [1, 0], [1, 1], ["a", "b"]),
+        calibration_data_of(np.ones((1, COUNT)), [0], [0], ["longer"]),
     )
     found = pooled([one, other])
     assert found.kind.tolist() == ["a", "b", "longer"]
@@ -335,13 +337,13 @@ def test_the_calibration_error_lies_between_that_of_all_as_one_and_that_of_each_
     ],
 )
 def test_queries_of_one_sort_alone_are_refused(right, known):
-    asked = asked_of(evidence_of(np.random.default_rng(0), 4), right, known)
+    data = calibration_data_of(evidence_of(np.random.default_rng(0), 4), right, known)
     with pytest.raises(DatasetError, match="needs right and wrong answers, and queries in the map and outside it"):
-        fit(asked, measured_on={})
+        fit(data, measured_on={})
 
 
 def test_sorts_without_evidence_do_not_count():
     evidence = evidence_of(np.random.default_rng(0), 4)
     evidence[3] = np.nan  # the only query outside
     with pytest.raises(DatasetError, match="queries in the map and outside it"):
-        fit(asked_of(evidence, [1, 0, 1, 0], [1, 1, 1, 0]), measured_on={})
+        fit(calibration_data_of(evidence, [1, 0, 1, 0], [1, 1, 1, 0]), measured_on={})

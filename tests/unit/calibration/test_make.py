@@ -8,7 +8,7 @@ pytest.importorskip("torch", reason="needs the extra `training`")
 
 from model_training.calibration import make  # after the skip
 from model_training.calibration.families import FAMILIES
-from model_training.calibration.fit import Asked, pooled
+from model_training.calibration.fit import CalibrationData, pooled
 from service.confidence.features import FEATURES
 
 COUNT, MARGIN = len(FEATURES), FEATURES.index("margin")
@@ -26,7 +26,7 @@ def city(seed, *, upside_down=False, count=1200):
         evidence[:, MARGIN] *= -1
     presets = np.where(rng.random(count) < 0.5, "precise", "stereo")
     names = np.array(["clear_", "other_city.", "removed_streets.", "wall.", "room."])[sort]
-    return Asked(
+    return CalibrationData(
         evidence=evidence,
         right=right,
         known=known,
@@ -99,7 +99,7 @@ class Work:
         return [city(len(self.asked), count=10)]
 
     def all_of(self, index, *, anew=False):
-        return make._asked(self.folder, self.encoder, index, anew=anew, report=print)
+        return make._data_of_city(self.folder, self.encoder, index, anew=anew, report=print)
 
 
 @pytest.fixture
@@ -132,8 +132,8 @@ def test_the_queries_of_a_city_are_localized_in_its_own_map_the_other_one_and_wi
 
 def test_repeating_blocks_are_asked_of_their_own_map_and_kept(work, monkeypatch):
     monkeypatch.setattr(make, "repeating_plan", lambda: SimpleNamespace(name="blocks"))
-    first = make._asked_repeating(work.folder, work.encoder, anew=False, report=print)
-    again = make._asked_repeating(work.folder, work.encoder, anew=False, report=print)
+    first = make._data_of_repeating(work.folder, work.encoder, anew=False, report=print)
+    again = make._data_of_repeating(work.folder, work.encoder, anew=False, report=print)
     assert work.asked == [("in_the_map", "blocks", "blocks", ())]
     assert work.built == [("blocks", False, "blocks", 1.0)]
     np.testing.assert_array_equal(first.evidence, again.evidence)
@@ -141,7 +141,7 @@ def test_repeating_blocks_are_asked_of_their_own_map_and_kept(work, monkeypatch)
 
 def test_a_family_localizes_the_queries_of_its_cities_in_both_maps(work):
     car = FAMILIES[0]
-    found = make._asked_family(work.folder, work.encoder, car, anew=False, report=print)
+    found = make._data_of_family(work.folder, work.encoder, car, anew=False, report=print)
     one, two = "calibration-car-1", "calibration-car-2"
     assert work.asked == [
         ("in_the_map", one, one, (), "car"),

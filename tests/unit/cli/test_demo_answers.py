@@ -9,12 +9,12 @@ from rich.console import Console
 
 from model_training.cli import demo_answers
 from model_training.cli.demo_answers import Outcome, ask, print_answers, print_next
-from model_training.cli.demo_map import Question
+from model_training.cli.demo_map import DemoQuery
 from service.errors import RefusedError
 from service.geometry.rigid import R_BODY_OPTICAL, rotation_z, transform_from
 
 TRUTH = transform_from(rotation_z(np.radians(170)) @ R_BODY_OPTICAL, np.array([10.0, 20.0, 1.5]))
-IN_STREET = Question("1", Path("a.jpg"), Path("a.png"), Path("front.json"), TRUTH, street=("s4", "Street 4"))
+IN_STREET = DemoQuery("1", Path("a.jpg"), Path("a.png"), Path("front.json"), TRUTH, street=("s4", "Street 4"))
 OF_PLACE = replace(IN_STREET, street=None, place=2)
 
 
@@ -29,7 +29,7 @@ def answer_of(*, street: str | None = "s4", place: int = 2) -> dict[str, Any]:
     }
 
 
-def outcome_of(question: Question = IN_STREET, **answer: Any) -> Outcome:
+def outcome_of(question: DemoQuery = IN_STREET, **answer: Any) -> Outcome:
     return Outcome(question, answer_of(**answer), "", 0.05)
 
 

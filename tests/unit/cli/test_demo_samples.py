@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from model_training.cli.demo_map import Question
+from model_training.cli.demo_map import DemoQuery
 from model_training.cli.demo_samples import write_samples
 from service.console.samples import Samples
 from service.geometry.rigid import R_BODY_OPTICAL, rotation_z, transform_from
@@ -16,13 +16,13 @@ from service.geometry.rigid import R_BODY_OPTICAL, rotation_z, transform_from
 TRUTH = transform_from(rotation_z(np.pi / 2) @ R_BODY_OPTICAL, np.array([1.0, 2.0, 3.0]))
 
 
-def question(folder: Path, **changed: Any) -> Question:
+def question(folder: Path, **changed: Any) -> DemoQuery:
     camera = {"camera": {"width": 64, "height": 48, "fx": 32, "fy": 32, "cx": 31.5, "cy": 23.5}}
     (folder / "front.json").write_text(json.dumps(camera))
     for name in ("000000.jpg", "000000.png"):
         (folder / name).write_bytes(name.encode())
     given = {"T_map_camera": TRUTH} | changed
-    return Question("1", folder / "000000.jpg", folder / "000000.png", folder / "front.json", **given)
+    return DemoQuery("1", folder / "000000.jpg", folder / "000000.png", folder / "front.json", **given)
 
 
 def test_a_service_reads_the_written_values(tmp_path: Path) -> None:

@@ -7,7 +7,7 @@ import pytest
 
 from model_training.datasets.dataset import Dataset
 from model_training.exporting.kitti_raw import DAY, DRIVE, POSES, write_kitti_raw
-from model_training.exporting.moments import moments, the_camera
+from model_training.exporting.moments import moments, single_camera
 from model_training.exporting.ros_bag import write_bag
 from model_training.importing.kinds import OpenSettings, open_recording
 from model_training.importing.pose_file import read_pose_file
@@ -131,4 +131,4 @@ def test_pictures_of_several_cameras_are_refused_by_name(dataset, tmp_path):
     (dataset.folder / "dataset.json").write_text(described.model_copy(update={"sensors": sensors}).model_dump_json())
     (dataset.folder / "queries" / "drive" / "cameras.txt").write_text("front\nrear\nfront\n")
     with pytest.raises(DatasetError, match=r"images of 2 cameras \(front, rear\)"):
-        the_camera(Dataset(dataset.folder), "drive")
+        single_camera(Dataset(dataset.folder), "drive")

@@ -11,7 +11,7 @@ from model_training.mapping import passes, work
 from model_training.mapping.passes import MOST, Passes, Targets, Vote, looked_through, tile_of
 from model_training.mapping.settings import BuildSettings
 from model_training.mapping.voxel_map import VoxelMap
-from model_training.mapping.work import Work
+from model_training.mapping.work import BuildCache
 from service.geometry.rigid import transform_from, transform_points
 
 SETTINGS = BuildSettings(name="street", spacing_m=4.0, calibration=None, align_survey=False)
@@ -53,7 +53,7 @@ def scan_of(T, *, car, van=None):
 def moved(cloud, dataset, poses, folder, *, earlier=None, each_scan=False):
     """Return the keys of the voxels that a vote of all scans removes, with chunks stored in a folder."""
     vote = Vote.of(cloud, dataset, poses, np.arange(len(poses)), SETTINGS, each_scan=each_scan)
-    return vote.removed(Work(folder, "k").chunks("votes", len(poses), vote.votes), earlier)
+    return vote.removed(BuildCache(folder, "k").chunks("votes", len(poses), vote.votes), earlier)
 
 
 def voted(tmp_path, *, cars, earlier=None):

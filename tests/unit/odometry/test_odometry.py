@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from model_training.odometry.find import find_trajectory
-from model_training.odometry.keyframes import Drive, Keyframe, drive_of
+from model_training.odometry.keyframes import Keyframe, OdometryTrajectory, drive_of
 from model_training.odometry.loops import Loop, LoopSettings, all_round, find_loops
 from model_training.odometry.pose_graph import closed, disagreement_m
 from model_training.odometry.scan_to_map import posed
@@ -111,7 +111,7 @@ def drive_on(poses, folder):
     between = poses @ transform_from(np.eye(3), np.array([0.5, 0.0, 0.0]))
     all_poses = np.stack([poses, between], axis=1).reshape(-1, 4, 4)
     stamps = np.stack([0.1 * np.arange(101), 0.1 * np.arange(101) + 0.05], axis=1).reshape(-1)
-    return Drive(stamps, all_poses, tuple(keyframe(k, T) for k, T in enumerate(poses)), folder)
+    return OdometryTrajectory(stamps, all_poses, tuple(keyframe(k, T) for k, T in enumerate(poses)), folder)
 
 
 @pytest.fixture
@@ -165,7 +165,7 @@ def test_a_perceptual_alias_is_not_registered(tmp_path):
     views = np.ones((24, 8), np.float32) / np.sqrt(8).astype(np.float32)
     near, far = (transform_from(np.eye(3), np.array([x, 0.0, 0.0])) for x in (0.0, 100.0))
     keyframes = (keyframe(0, near, views), Keyframe(4, 1.0, far, 100.0, NO_LEVEL, 0.0, views))
-    drive = Drive(np.array([0.0, 1.0]), np.stack([near, far]), keyframes, tmp_path)
+    drive = OdometryTrajectory(np.array([0.0, 1.0]), np.stack([near, far]), keyframes, tmp_path)
     told = []
     assert find_loops(drive, LoopSettings(every=1), report=lambda *each: told.append(each)) == []
     assert told == [(1, 2), (2, 2)]

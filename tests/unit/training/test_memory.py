@@ -26,12 +26,12 @@ def test_old_descriptors_are_left_out(memory):
 
 
 def test_the_perceptual_alias_of_another_place_is_found(memory):
-    assert memory.alike(np.array([1]), np.arange(6), each=1).tolist() == [1, 2]
+    assert memory.hard_negatives(np.array([1]), np.arange(6), each=1).tolist() == [1, 2]
 
 
 def test_views_of_the_same_place_are_no_hard_negatives(memory):
     memory.surveys_xy[2] = memory.queries_xy[1] + 2.0
-    assert 2 not in memory.alike(np.array([1]), np.array([0, 1, 2, 4]), each=2)
+    assert 2 not in memory.hard_negatives(np.array([1]), np.array([0, 1, 2, 4]), each=2)
 
 
 def test_kept_descriptors_do_not_hold_the_graph(memory):

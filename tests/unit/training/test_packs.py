@@ -23,12 +23,12 @@ from model_training.training.recipe import (
     RECIPES,
     STOCK_CITIES,
     TRAINING_SEEDS,
-    WATCH_SEEDS,
+    VALIDATION_SEEDS,
     more_street_plans,
     paper_plans,
     stock_plans,
     street_plans,
-    watch_plans,
+    validation_plans,
 )
 from service.errors import DatasetError
 from service.imaging.view_grid import ViewGrid
@@ -114,7 +114,8 @@ def test_rows_with_hardly_a_measurement_are_not_seen():
 
 
 @pytest.mark.parametrize(
-    ("one", "other"), [*itertools.combinations([TRAINING_SEEDS, WATCH_SEEDS, CALIBRATION_SEEDS, EVALUATION_SEEDS], 2)]
+    ("one", "other"),
+    [*itertools.combinations([TRAINING_SEEDS, VALIDATION_SEEDS, CALIBRATION_SEEDS, EVALUATION_SEEDS], 2)],
 )
 def test_seeds_of_training_watching_calibration_and_evaluation_are_disjoint(one, other):
     assert not set(one) & set(other)
@@ -128,7 +129,7 @@ def test_the_stock_encoder_is_not_trained_on_evaluation_cities():
 
 
 def test_training_is_watched_on_cities_of_its_own():
-    assert {plan.seed for plan in watch_plans()} <= set(WATCH_SEEDS)
+    assert {plan.seed for plan in validation_plans()} <= set(VALIDATION_SEEDS)
 
 
 def test_the_trainings_on_many_small_cities_share_only_cities_of_the_stock_recipe():
@@ -242,7 +243,7 @@ def test_a_pack_without_matching_has_no_mask(pack):
 
 def test_the_papers_city_is_only_in_its_own_recipe():
     assert {plan.name for plan in paper_plans()} == {"paper"}
-    assert {plan.name for plan in stock_plans(50) + watch_plans()} == {"city"}
+    assert {plan.name for plan in stock_plans(50) + validation_plans()} == {"city"}
     assert not {plan.name for plan in street_plans() + more_street_plans()} - {"city", "mixed"}
 
 

@@ -11,7 +11,7 @@ from model_training.datasets.dataset import Dataset
 from model_training.mapping.settings import BuildSettings
 from model_training.mapping.survey import fan, fan_views, kept_scans, levelled_scans, sampled_survey
 from model_training.simulation.plan import QueryPlan, SimulationPlan
-from model_training.training.recipe import WATCH_SEEDS
+from model_training.training.recipe import VALIDATION_SEEDS
 from service.geometry.rigid import heading_of_body
 from service.imaging.query_view import query_views
 from service.imaging.view_grid import PLANES, ViewGrid, survey_planes
@@ -22,10 +22,10 @@ from service.retrieval.retrieve import turns_on
 REACH_M = 5.0
 
 
-def watch_plan() -> SimulationPlan:
+def validation_plan() -> SimulationPlan:
     """Plan a city that no training and no bar has seen."""
     drive = QueryPlan(name="drive1", traversal=1, count=500, depths=("precise", "stereo"))
-    return SimulationPlan(name="watch", seed=WATCH_SEEDS[1], queries=(drive,))
+    return SimulationPlan(name="watch", seed=VALIDATION_SEEDS[1], queries=(drive,))
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,7 +56,7 @@ class Seen:
         return best
 
 
-class WatchCity:
+class ValidationCity:
     """Places and queries of the city, rendered as views once for all encoders.
 
     Args:

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from model_training.calibration.strangers import KINDS, Box, strangers
+from model_training.calibration.out_of_map import KINDS, Box, out_of_map_queries
 from model_training.simulation.depth_noise import DEPTHS
 from service.geometry.camera import PinholeCamera
 
@@ -41,8 +41,8 @@ def test_who_stands_inside_enters_nothing():
 
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("preset", ["precise", "stereo"])
-def test_strangers_are_pictures_that_a_depth_camera_takes(kind, preset):
-    drawn = list(strangers(kind, CAMERA, DEPTHS[preset], 12, np.random.default_rng(1)))
+def test_out_of_map_queries_are_pictures_that_a_depth_camera_takes(kind, preset):
+    drawn = list(out_of_map_queries(kind, CAMERA, DEPTHS[preset], 12, np.random.default_rng(1)))
     assert len(drawn) == 12
     for query in drawn:
         assert query.rgb.shape == (48, 64, 3)
@@ -57,7 +57,7 @@ def test_strangers_are_pictures_that_a_depth_camera_takes(kind, preset):
 @pytest.mark.parametrize("kind", KINDS)
 def test_chance_alone_makes_them_differ(kind):
     first, again, other = (
-        next(strangers(kind, CAMERA, DEPTHS["precise"], 1, np.random.default_rng(seed))) for seed in (1, 1, 2)
+        next(out_of_map_queries(kind, CAMERA, DEPTHS["precise"], 1, np.random.default_rng(seed))) for seed in (1, 1, 2)
     )
     np.testing.assert_array_equal(first.depth_m, again.depth_m)
     assert not np.array_equal(first.depth_m, other.depth_m)
@@ -66,7 +66,7 @@ def test_chance_alone_makes_them_differ(kind):
 def test_a_wall_stands_upright_before_the_camera():
     """Along most columns the depth does not change with the row, but for tilt: a wall, not a floor."""
     upright = 0
-    for query in strangers("wall", CAMERA, DEPTHS["ideal"], 20, np.random.default_rng(4)):
+    for query in out_of_map_queries("wall", CAMERA, DEPTHS["ideal"], 20, np.random.default_rng(4)):
         middle = query.depth_m[8:24, 32]
         middle = middle[middle > 0]
         upright += len(middle) > 4 and np.ptp(middle) < 0.25 * middle.mean()

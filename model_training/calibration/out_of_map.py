@@ -109,7 +109,7 @@ def _ground(rng: np.random.Generator) -> float:
 KINDS: dict[str, Callable[[np.random.Generator], list[Box]]] = {"wall": wall, "room": room}
 
 
-def strangers(
+def out_of_map_queries(
     kind: str, camera: PinholeCamera, model: DepthModel, count: int, rng: np.random.Generator
 ) -> Iterator[Query]:
     """Yield out-of-map queries of one kind, with the errors of a depth camera, tilted by a few degrees like a robot's camera.

@@ -1,0 +1,236 @@
+"""Check that a change of code leaves all answers equal -> reports/checks/same_answers.json.
+
+Most changes of the answering code only rename or move things. Then measuring all rows again takes hours and shows nothing. This command
+runs both versions of the code on the same small cities, and on KITTI drive 0005 if it is there: ``simulate`` or ``import``, ``build-map``
+and ``evaluate``. It compares the files of the maps and every number of the answers, except durations. If all are equal to the bit, rows
+of these answers stay valid over the change (``benchmarks.provenance``).
+
+Example: python -m benchmarks.same_answers --before HEAD~3
+"""
+
+import argparse
+import json
+import os
+import shutil
+import subprocess
+import sys
+import tempfile
+from collections.abc import Sequence
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from benchmarks.provenance import CHECKS, ROOT, git, head_commit, is_dirty, machine
+from benchmarks.real.streets import unpacked
+
+#: Beginnings of the ids of rows that a check covers, by report: answers to single queries without a prior on maps of one bundle.
+COVERED = {"accuracy": ("full.", "retrieval.", "rigs.", "height.", "ground.", "doubt.")}
+#: Fields of the answers that differ between two runs of the same code.
+DURATIONS = ("ms",)
+DRIVE = "kitti_0005"
+
+
+@dataclass(frozen=True, slots=True)
+class Recording:
+    """A dataset of the check.
+
+    Attributes:
+        name: name of its folders.
+        options: arguments of ``streetfix simulate`` or ``streetfix import``, without ``--out``.
+    """
+
+    name: str
+    options: tuple[str, ...]
+
+
+_SIZE = ("--size", "120x150", "--queries", "40", "--drives", "2")
+#: Modelled depth errors; a car with matched stereo pairs and a sparse survey; a small camera with a narrow view and a short range.
+SIMULATED = (
+    Recording("city", ("simulate", "--seed", "7101", *_SIZE, "--depth", "precise", "--depth", "stereo")),
+    Recording(
+        "car",
+        ("simulate", "--seed", "7102", "--city", "mixed", *_SIZE, "--lidar", "hdl_64", "--spacing", "2.5", "--camera", "1242x376",
+         "--hfov", "81.4", "--depth", "sgbm", "--set", "stereo.focal_baseline_px_m=384"),
+    ),
+    Recording(
+        "robot",
+        ("simulate", "--seed", "7103", "--city", "mixed", *_SIZE, "--lidar", "vlp_16", "--camera", "640x360", "--hfov", "69",
+         "--depth", "precise", "--set", "depth.max_range_m=12"),
+    ),
+)  # fmt: skip
+
+
+class DifferentAnswersError(Exception):
+    """The two versions of the code differ in a file of a map, or in a number of an answer."""
+
+
+class Version:
+    """A checked-out version of the code that can run ``streetfix``.
+
+    Args:
+        folder: root of the repository or of a work tree.
+        work: folder of its datasets, maps and answers.
+    """
+
+    def __init__(self, folder: Path, work: Path) -> None:
+        self._folder, self.work = folder, work
+
+    def run(self, *arguments: str) -> None:
+        """Run a command of ``streetfix`` with the code of this version.
+
+        Args:
+            *arguments: arguments of the command.
+
+        Raises:
+            RuntimeError: the code of another folder would run.
+            subprocess.CalledProcessError: the command failed.
+        """
+        code = (
+            "import pathlib, sys, service, model_training\n"
+            f"root = pathlib.Path({str(self._folder)!r})\n"
+            "for module in (service, model_training):\n"
+            "    if not pathlib.Path(module.__file__).is_relative_to(root):\n"
+            "        sys.exit(f'{module.__file__} is not in {root}')\n"
+            "from service.cli.start import main\n"
+            "main()\n"
+        )
+        environment = os.environ | {"PYTHONPATH": str(self._folder)}
+        subprocess.run([sys.executable, "-c", code, *arguments], cwd=self._folder, env=environment, check=True)
+
+    def answers(self, recording: Recording) -> Path:
+        """Make a dataset, build its map and answer its queries; return the folder of the map and the answers.
+
+        Args:
+            recording: the dataset.
+        """
+        folder = self.work / recording.name
+        data, bundle, answers = (str(folder / name) for name in ("data", "map", "answers"))
+        self.run(*recording.options, "--out", data)
+        self.run("build-map", data, "--out", bundle)
+        self.run("evaluate", bundle, data, "--predictions", answers, "--list", "0")
+        return folder
+
+
+def compare(before: Path, after: Path) -> int:
+    """Compare the maps and the answers of two versions; return the number of queries.
+
+    Args:
+        before: folder of ``Version.answers``.
+        after: the same of the other version.
+
+    Raises:
+        DifferentAnswersError: they differ. The message names the first difference.
+    """
+    files = [json.loads((folder / "map" / "manifest.json").read_text())["files"] for folder in (before, after)]
+    for name in sorted(files[0].keys() | files[1].keys()):
+        if files[0].get(name) != files[1].get(name):
+            raise DifferentAnswersError(f"{after.name}: the map's file {name} differs")
+    names = [sorted(path.name for path in (folder / "answers").glob("*.npz")) for folder in (before, after)]
+    if names[0] != names[1] or not names[0]:
+        raise DifferentAnswersError(f"{after.name}: query sets {names[0]} and {names[1]}")
+    count = 0
+    for name in names[0]:
+        with np.load(before / "answers" / name) as one, np.load(after / "answers" / name) as other:
+            if set(one.files) != set(other.files):
+                raise DifferentAnswersError(f"{after.name}/{name}: fields {sorted(set(one.files) ^ set(other.files))}")
+            for field in sorted(set(one.files) - set(DURATIONS)):
+                numbers = one[field].dtype.kind == "f"
+                if not np.array_equal(one[field], other[field], equal_nan=numbers):
+                    raise DifferentAnswersError(f"{after.name}/{name}: {field} differs")
+            count += len(one["T_true"])
+    return count
+
+
+def work_tree(commit: str, folder: Path) -> Path:
+    """Check out a commit beside this one, with the compiled code of this one; return its folder.
+
+    Args:
+        commit: the commit.
+        folder: a folder that does not exist yet.
+
+    Raises:
+        ValueError: the commit is unknown, or its C code differs, so that it needs a build of its own.
+    """
+    if git("cat-file", "-e", f"{commit}^{{commit}}") is None:
+        raise ValueError(f"--before: {commit} is not a commit of this repository")
+    changed = (git("diff", "--name-only", commit, "HEAD") or "").split()
+    if compiled := [name for name in changed if name.endswith((".c", ".h")) or name.startswith("native/")]:
+        raise ValueError(f"--before: {compiled[0]} differs, and the check does not compile; measure the rows again")
+    if git("worktree", "add", "--detach", str(folder), commit) is None:
+        raise ValueError(f"--before: cannot check out {commit} in {folder}")
+    for package in ("service", "model_training"):
+        for library in (ROOT / package).rglob("*.so"):
+            shutil.copy(library, folder / library.relative_to(ROOT))
+    return folder
+
+
+def record(before: str, after: str, queries: dict[str, int]) -> dict[str, Any]:
+    """Return the record of a passed check.
+
+    Args:
+        before: commit of the older version.
+        after: commit of the newer version.
+        queries: number of compared queries of each dataset.
+    """
+    return {
+        "before": before,
+        "after": after,
+        "date": datetime.now(UTC).isoformat(timespec="seconds"),
+        "machine": machine(),
+        "queries": queries,
+        "covered": {report: list(beginnings) for report, beginnings in COVERED.items()},
+    }
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Parse the arguments, compare both versions and write the record; return 1 if they differ.
+
+    Args:
+        arguments: arguments of the command; None takes those of the process.
+    """
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--before", required=True, help="commit of the older version")
+    parser.add_argument(
+        "--data", type=Path, default=ROOT.parent / "shared" / "data", help="folder of the real recordings"
+    )
+    given = parser.parse_args(arguments)
+    if is_dirty():
+        parser.error("the code differs from HEAD; commit first, so that the record can name what it compared")
+    before = git("rev-parse", f"{given.before}^{{commit}}") or given.before
+    with tempfile.TemporaryDirectory(prefix="same_answers_") as name:
+        work = Path(name)
+        try:
+            tree = work_tree(before, work / "before")
+        except ValueError as error:
+            parser.error(str(error))
+        try:
+            recordings = [*SIMULATED, *_real(given.data, work)]
+            older, newer = Version(tree, work / "answers_before"), Version(ROOT, work / "answers_after")
+            queries: dict[str, int] = {}
+            for number, recording in enumerate(recordings):
+                print(f"--- {recording.name} ({number + 1} of {len(recordings)})", flush=True)
+                queries[recording.name] = compare(older.answers(recording), newer.answers(recording))
+                print(f"{recording.name}: {queries[recording.name]} equal answers", flush=True)
+        except DifferentAnswersError as difference:
+            print(f"different: {difference}")
+            return 1
+        finally:
+            git("worktree", "remove", "--force", str(tree))
+    CHECKS.parent.mkdir(parents=True, exist_ok=True)
+    kept = json.loads(CHECKS.read_text()) if CHECKS.exists() else []
+    CHECKS.write_text(json.dumps([*kept, record(before, head_commit(), queries)], indent=1) + "\n")
+    print(f"written: {CHECKS.relative_to(ROOT)}")
+    return 0
+
+
+def _real(data: Path, work: Path) -> list[Recording]:
+    """Return the real drive, unpacked; nothing without the recordings."""
+    drive = unpacked(data, work, DRIVE)
+    return [] if drive is None else [Recording(DRIVE, ("import", "kitti-raw", str(drive), "--depth", "sgbm"))]
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,105 @@
+import json
+import subprocess
+import sys
+from typing import Any
+
+import numpy as np
+import pytest
+
+from benchmarks import same_answers
+from benchmarks.same_answers import DifferentAnswersError, Version, compare, main
+
+
+def written(folder, *, cloud="aa", status="LOCALIZED", ms=1.0, confidence=np.nan, sets=("drive1",), **more):
+    (folder / "map").mkdir(parents=True)
+    (folder / "map" / "manifest.json").write_text(json.dumps({"files": {"cloud": {"sha256": cloud}}}))
+    (folder / "answers").mkdir()
+    for name in sets:
+        fields: dict[str, Any] = {
+            "T_true": np.zeros((2, 4, 4)),
+            "status": np.array([status, ""]),
+            "confidence": np.array([confidence, 0.5]),
+        }
+        np.savez(folder / "answers" / f"{name}.npz", ms=np.full(2, ms), **fields, **more)
+    return folder
+
+
+def test_equal_answers_are_counted_and_durations_do_not_matter(tmp_path):
+    one = written(tmp_path / "a" / "city", sets=("drive1", "drive2"))
+    assert compare(one, written(tmp_path / "b" / "city", ms=2.0, sets=("drive1", "drive2"))) == 4
+
+
+@pytest.mark.parametrize(
+    ("change", "what"),
+    [
+        ({"cloud": "bb"}, "city: the map's file cloud differs"),
+        ({"status": "AMBIGUOUS"}, "city/drive1.npz: status differs"),
+        ({"confidence": 0.1}, "city/drive1.npz: confidence differs"),
+        ({"sets": ("drive2",)}, "city: query sets"),
+        ({"sets": ()}, "city: query sets"),
+        ({"candidates": np.zeros(2)}, r"city/drive1.npz: fields \['candidates'\]"),
+    ],
+)
+def test_the_first_difference_is_named(tmp_path, change, what):
+    with pytest.raises(DifferentAnswersError, match=what):
+        compare(written(tmp_path / "a" / "city"), written(tmp_path / "b" / "city", **change))
+
+
+def test_a_number_that_differs_in_its_last_bit_differs(tmp_path):
+    with pytest.raises(DifferentAnswersError, match="confidence"):
+        compare(
+            written(tmp_path / "a" / "city", confidence=0.1),
+            written(tmp_path / "b" / "city", confidence=np.nextafter(0.1, 1)),
+        )
+
+
+def test_a_version_runs_its_own_code_only(tmp_path):
+    """Without its own packages the installed code would run, and the check would compare it with itself."""
+    with pytest.raises(subprocess.CalledProcessError):
+        Version(tmp_path, tmp_path / "work").run("--help")
+
+
+def test_changes_that_are_not_committed_are_refused(monkeypatch, capsys):
+    monkeypatch.setattr(same_answers, "is_dirty", lambda: True)
+    with pytest.raises(SystemExit):
+        main(["--before", "HEAD"])
+    assert "commit first" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(("changed", "what"), [(None, "is not a commit"), ("native/build.ninja", "does not compile")])
+def test_an_unknown_commit_and_other_c_code_are_refused(monkeypatch, capsys, changed, what):
+    answers = {"rev-parse": "f" * 40, "cat-file": None if changed is None else "", "diff": changed}
+    monkeypatch.setattr(same_answers, "is_dirty", lambda: False)
+    monkeypatch.setattr(same_answers, "git", lambda command, *_: answers[command])
+    with pytest.raises(SystemExit):
+        main(["--before", "HEAD"])
+    assert what in capsys.readouterr().err
+
+
+def test_a_difference_fails_and_leaves_no_record(tmp_path, monkeypatch, capsys):
+    """Both versions are folders that were written before; git and streetfix do not run."""
+    found = {"before": written(tmp_path / "before" / "city"), "after": written(tmp_path / "after" / "city", cloud="bb")}
+    checks = tmp_path / "checks" / "same_answers.json"
+    monkeypatch.setattr(same_answers, "ROOT", tmp_path)
+    monkeypatch.setattr(same_answers, "CHECKS", checks)
+    monkeypatch.setattr(same_answers, "is_dirty", lambda: False)
+    monkeypatch.setattr(same_answers, "git", lambda *_: "f" * 40)
+    monkeypatch.setattr(same_answers, "work_tree", lambda _, folder: folder)
+    monkeypatch.setattr(same_answers, "head_commit", lambda: "e" * 40)
+    monkeypatch.setattr(same_answers, "SIMULATED", same_answers.SIMULATED[:1])
+    monkeypatch.setattr(Version, "answers", lambda version, _: found[version.work.name.removeprefix("answers_")])
+    arguments = ["--before", "HEAD", "--data", str(tmp_path)]
+    assert main(arguments) == 1
+    assert "the map's file cloud differs" in capsys.readouterr().out
+    assert not checks.exists()
+    found["after"] = found["before"]
+    assert main(arguments) == 0
+    (kept,) = json.loads(checks.read_text())
+    assert (kept["before"], kept["after"], kept["queries"]) == ("f" * 40, "e" * 40, {"city": 2})
+
+
+def test_the_command_has_help():
+    done = subprocess.run(
+        [sys.executable, "-m", "benchmarks.same_answers", "--help"], capture_output=True, text=True, check=True
+    )
+    assert "Example:" in done.stdout
