@@ -63,6 +63,13 @@ SIMULATED = (
 )  # fmt: skip
 
 
+#: Python runs this before anything else. An editable installation imports its own folder first, whatever ``PYTHONPATH`` says.
+_NOT_INSTALLED = """import sys
+
+sys.meta_path[:] = [each for each in sys.meta_path if not type(each).__module__.startswith("_editable_")]
+"""
+
+
 class DifferentAnswersError(Exception):
     """The two versions of the code differ in a file of a map, or in a number of an answer."""
 
@@ -97,7 +104,10 @@ class Version:
             "from service.cli.start import main\n"
             "main()\n"
         )
-        environment = os.environ | {"PYTHONPATH": str(self._folder)}
+        first = self.work / "first"
+        first.mkdir(parents=True, exist_ok=True)
+        (first / "sitecustomize.py").write_text(_NOT_INSTALLED)
+        environment = os.environ | {"PYTHONPATH": os.pathsep.join(map(str, (self._folder, first)))}
         subprocess.run([sys.executable, "-c", code, *arguments], cwd=self._folder, env=environment, check=True)
 
     def answers(self, recording: Recording) -> Path:
