@@ -2,6 +2,7 @@
 
 import argparse
 import json
+import tarfile
 import tempfile
 import tomllib
 from collections.abc import Callable
@@ -12,6 +13,7 @@ from benchmarks.house.docstrings import all_lacking, code_lines
 from benchmarks.house.installation import distributions_of
 from benchmarks.house.prose import docstrings, pages, prose_of_markdown, reading_ease
 from benchmarks.house.request_path import trace_of_request
+from benchmarks.provenance import git
 from benchmarks.report import ROOT, Report
 from model_training.datasets.dataset import Dataset
 from model_training.mapping.build import build_map
@@ -21,6 +23,8 @@ from model_training.simulation.simulate import simulate
 from model_training.stock import CALIBRATION, ENCODER
 
 MOST_LINES, LONGEST_LINE, EASE = 120, 200, 55.0
+#: Commit at which a review called the language "compressed and idiolectal".
+BEFORE = "d8391ab"
 
 
 def main() -> None:
@@ -70,6 +74,21 @@ def _reading_rows(report: Report, documents: list[str]) -> None:
     report.row("docs.reading_ease.documents", reading_ease(of_documents), "points")
     report.row("docs.reading_ease.docstrings", reading_ease(of_docstrings), "points")
     report.row("docs.reading_ease", reading_ease(f"{of_documents}\n{of_docstrings}"), "points", bar=EASE)
+    report.row(
+        "docs.reading_ease.before", _reading_ease_of(BEFORE), "points", why=f"of commit {BEFORE}, before the rewriting"
+    )
+
+
+def _reading_ease_of(commit: str) -> float | None:
+    """Return the reading ease of documents and docstrings at a commit; None if this clone lacks it."""
+    with tempfile.TemporaryDirectory(prefix="house-") as name:
+        archive, root = Path(name, "archive.tar"), Path(name, "tree")
+        if git("archive", f"--output={archive}", commit) is None:
+            return None
+        with tarfile.open(archive) as tar:
+            tar.extractall(root, filter="data")
+        documents = "\n".join(prose_of_markdown(page.read_text()) for page in pages(root))
+        return reading_ease("\n".join([documents, *docstrings(root)]))
 
 
 def _docstring_rows(report: Report) -> None:

@@ -17,9 +17,13 @@ _CODE = re.compile(r"`+[^`]*`+")
 _WORD = re.compile(r"[A-Za-z][A-Za-z'-]*[A-Za-z]|[A-Za-z]")
 
 
-def pages() -> list[Path]:
-    """Return README and all pages of ``docs``, including the decision log."""
-    return [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
+def pages(root: Path = ROOT) -> list[Path]:
+    """Return README and all pages of ``docs``, including the decision log.
+
+    Args:
+        root: folder of the repository.
+    """
+    return [root / "README.md", *sorted((root / "docs").rglob("*.md"))]
 
 
 def prose_of_markdown(text: str) -> str:
@@ -51,10 +55,14 @@ def prose_of_docstrings(source: str) -> str:
     return _plain("\n\n".join(headless))
 
 
-def docstrings() -> Iterator[str]:
-    """Yield the prose of each module of ``PACKAGES``, except generated ones."""
+def docstrings(root: Path = ROOT) -> Iterator[str]:
+    """Yield the prose of each module of ``PACKAGES``, except generated ones.
+
+    Args:
+        root: folder of the repository.
+    """
     for package in PACKAGES:
-        for path in sorted((ROOT / package).rglob("*.py")):
+        for path in sorted((root / package).rglob("*.py")):
             if "generated" not in path.parts:
                 yield prose_of_docstrings(path.read_text())
 
