@@ -13,6 +13,7 @@ from typing import Any, Literal
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from torch.nn.parallel import DistributedDataParallel
 from torch.utils.tensorboard import SummaryWriter
@@ -166,7 +167,6 @@ def train(
         EncoderError: ``start_from`` is a file, but no encoder of the configured shape.
         KeyboardInterrupt: after the checkpoint was saved.
     """
-    grid = ViewGrid(rows=config.encoder.rows, columns=config.encoder.columns)
     place = together.device(device_of(device))
     require_shards(config, together.count)
     if start_from is not None:
@@ -174,127 +174,193 @@ def train(
     together.require_shared(run, "run")
     together.in_turn(lambda: _keep_config(run, config))
     together.in_turn(lambda: _keep_packs(run, packs, start_from))
-    torch.manual_seed(config.seed)
-    rng = np.random.default_rng(config.seed)
-    generator = torch.Generator(device=place).manual_seed(config.seed)
-    augment = Augmenter(config.augmentation, grid, generator, place)
-    checkpoint = run / "checkpoint.pt"
-    cities = open_cities(packs, grid, turn_deg=config.turn_deg, pairs=config.pairs, device=place)
-    log_scale = torch.nn.Parameter(torch.tensor(float(np.log(1 / 0.07)), device=place))
-    net = EncoderNet(config.encoder)
-    if start_from is not None and not start_from.is_dir() and not (resume and checkpoint.exists()):
-        net = net_of(start_from, config.encoder, *_views_of_all(cities, config, augment, rng))
-        log_scale.data.fill_(float(np.log(config.largest_scale)))
-    net = net.to(place)
-    net = net.to(memory_format=torch.channels_last)  # type: ignore[call-overload]  # torch documents it, its stub does not
-    optimiser = _optimiser([*net.parameters(), log_scale], config)
-    first = 0
-    memories = [DescriptorMemory(len(city.pack.queries), config.encoder.descriptor, place) for city in cities]
-    if start_from is not None and start_from.is_dir():
-        before = read_checkpoint(start_from, place)
-        net.load_state_dict(before["net"])
-        log_scale.data.copy_(before["log_scale"])
-    if resume and checkpoint.exists():
-        state = read_checkpoint(run, place)
-        net.load_state_dict(state["net"])
-        optimiser.load_state_dict(state["optimiser"])
-        log_scale.data.copy_(state["log_scale"])
-        generator.set_state(state["generator"].cpu())
-        rng.bit_generator.state = json.loads(state["rng"])
-        first = int(state["step"])
-        for memory, kept in zip(memories, state["memories"], strict=True):
-            memory.restore(kept)
+    state = _State(packs, run, config, place, together, start_from=start_from, resume=resume)
     together.wait()  # no process may replace the checkpoint before all have read it
-    encode = _shared(net, together, place)
-
-    def save(step: int) -> None:
-        if not together.is_first:
-            return
-        part = checkpoint.with_suffix(".part")
-        torch.save(
-            {
-                "net": net.state_dict(),
-                "optimiser": optimiser.state_dict(),
-                "log_scale": log_scale.detach(),
-                "step": step,
-                "generator": generator.get_state(),
-                "rng": json.dumps(rng.bit_generator.state),
-                "memories": [memory.state() for memory in memories],
-            },
-            part,
-        )
-        part.rename(checkpoint)
-
-    net.train()
+    state.share()
     with (
         SummaryWriter(str(run / "tensorboard")) if together.is_first else nullcontext() as log,
         _Interrupt() as interrupt,
     ):
         began, images = time.perf_counter(), 0
-        for step in range(first, config.steps):
-            _set_rate(optimiser, config, step)
-            number = int(rng.integers(len(cities)))
-            memory, wanted = memories[number], None
-            remembers = config.memory_after is not None and step >= config.memory_after
-            known = memory.recent(step, config.memory_steps) if remembers else np.zeros(0, np.int64)
-            if len(known) > config.pairs:
-                seeds = rng.choice(known, min(config.alike_seeds, len(known)), replace=False)
-                wanted = together.of_first(memory.hard_negatives(seeds, known, config.alike_each))
-            choice = cities[number].choose(config.pairs, rng, wanted)
-            bounds = shard_bounds(len(choice), config.shards)
-            planes = _own_views(cities[number], choice, bounds, together, augment, config, step)
-            count = len(planes) // 2
-            with forward_in(config.precision, place.type):
-                descriptors = encode(planes, queries_first(planes, count))
-            descriptors = descriptors.float()
-            of_queries, of_surveys = together.gather(
-                descriptors[:count], descriptors[count:], sizes=_sizes(bounds, together)
-            )
-            scale = log_scale.exp().clamp(max=config.largest_scale)
-            q = Side(of_queries, choice.query_xy.to(place))
-            m = Side(of_surveys, choice.survey_xy.to(place))
-            earlier = torch.from_numpy(np.setdiff1d(known, choice.pairs) if config.stale_negatives else known[:0]).to(
-                place
-            )
-            losses, first_ones = _LOSSES[config.loss](
-                q,
-                m,
-                scale=scale,
-                more_queries=Side(memory.queries[earlier], memory.queries_xy[earlier]),
-                more_surveys=Side(memory.surveys[earlier], memory.surveys_xy[earlier]),
-            )
-            memory.keep(choice.pairs, q.descriptors, m.descriptors, q.xy, m.xy, step)
-            loss = losses.mean()
-            optimiser.zero_grad(set_to_none=True)
-            loss.backward()  # type: ignore[no-untyped-call]  # torch's own stub leaves it untyped
-            together.average_gradient(log_scale)
-            torch.nn.utils.clip_grad_norm_(net.parameters(), config.gradient_norm)
-            optimiser.step()
-            images += 2 * len(choice)
-            state_now = Progress(
-                step + 1,
-                config.steps,
-                float(loss.detach()),
-                float(first_ones.float().mean()),
-                images / (time.perf_counter() - began),
-            )
+        for step in range(state.first_step, config.steps):
+            done = state.step(step)
+            images += 2 * done.pairs
             if log is not None:
-                report(state_now)
+                speed = images / (time.perf_counter() - began)
+                report(Progress(step + 1, config.steps, done.loss, done.accuracy, speed))
                 if (step + 1) % 10 == 0:
-                    log.add_scalar("loss", state_now.loss, step + 1)
-                    log.add_scalar("own_view_first", state_now.accuracy, step + 1)
-                    log.add_scalar("scale", float(scale.detach()), step + 1)
+                    log.add_scalar("loss", done.loss, step + 1)
+                    log.add_scalar("own_view_first", done.accuracy, step + 1)
+                    log.add_scalar("scale", done.scale, step + 1)
             if (step + 1) % save_every == 0 or step + 1 == config.steps:
-                save(step + 1)
+                state.save(step + 1)
             if together.any(interrupt.asked):
-                save(step + 1)
+                state.save(step + 1)
                 raise KeyboardInterrupt
-    if together.count > 1:  # the caller gets layers that need no other process
-        plain = EncoderNet(config.encoder).to(place)
-        plain.load_state_dict(net.state_dict())
-        net = plain
-    trained: EncoderNet = net.eval()
-    return trained
+    return state.trained()
+
+
+@dataclass(frozen=True, slots=True)
+class _Step:
+    """Result of one step: loss, share of pairs whose own survey view is the most similar one, inverse temperature, pairs."""
+
+    loss: float
+    accuracy: float
+    scale: float
+    pairs: int
+
+
+class _State:
+    """Everything that a run changes: weights, optimiser, random numbers, and descriptors of earlier batches.
+
+    Its start is the checkpoint of the run if ``resume``, else the weights of ``start_from``, else random weights.
+    """
+
+    def __init__(
+        self,
+        packs: list[Path],
+        run: Path,
+        config: TrainingConfig,
+        place: torch.device,
+        together: Processes,
+        *,
+        start_from: Path | None,
+        resume: bool,
+    ) -> None:
+        self._run, self._config, self._place, self._together = run, config, place, together
+        grid = ViewGrid(rows=config.encoder.rows, columns=config.encoder.columns)
+        torch.manual_seed(config.seed)
+        self._rng = np.random.default_rng(config.seed)
+        self._generator = torch.Generator(device=place).manual_seed(config.seed)
+        self._augment = Augmenter(config.augmentation, grid, self._generator, place)
+        self._cities = open_cities(packs, grid, turn_deg=config.turn_deg, pairs=config.pairs, device=place)
+        self._log_scale = torch.nn.Parameter(torch.tensor(float(np.log(1 / 0.07)), device=place))
+        resumes = resume and self._checkpoint.exists()
+        net = EncoderNet(config.encoder)
+        if start_from is not None and not start_from.is_dir() and not resumes:
+            net = net_of(start_from, config.encoder, *_views_of_all(self._cities, config, self._augment, self._rng))
+            self._log_scale.data.fill_(float(np.log(config.largest_scale)))
+        net = net.to(place)
+        self._net = net.to(memory_format=torch.channels_last)  # type: ignore[call-overload]  # missing in torch's stub
+        self._encode: torch.nn.Module = self._net
+        self._optimiser = _optimiser([*self._net.parameters(), self._log_scale], config)
+        self._memories = [
+            DescriptorMemory(len(city.pack.queries), config.encoder.descriptor, place) for city in self._cities
+        ]
+        self.first_step = 0
+        if start_from is not None and start_from.is_dir():
+            before = read_checkpoint(start_from, place)
+            self._net.load_state_dict(before["net"])
+            self._log_scale.data.copy_(before["log_scale"])
+        if resumes:
+            self._restore()
+
+    @property
+    def _checkpoint(self) -> Path:
+        return self._run / "checkpoint.pt"
+
+    def _restore(self) -> None:
+        kept = read_checkpoint(self._run, self._place)
+        self._net.load_state_dict(kept["net"])
+        self._optimiser.load_state_dict(kept["optimiser"])
+        self._log_scale.data.copy_(kept["log_scale"])
+        self._generator.set_state(kept["generator"].cpu())
+        self._rng.bit_generator.state = json.loads(kept["rng"])
+        self.first_step = int(kept["step"])
+        for memory, descriptors in zip(self._memories, kept["memories"], strict=True):
+            memory.restore(descriptors)
+
+    def save(self, step: int) -> None:
+        """Write the checkpoint, in the first process only.
+
+        Args:
+            step: number of finished steps.
+        """
+        if not self._together.is_first:
+            return
+        part = self._checkpoint.with_suffix(".part")
+        torch.save(
+            {
+                "net": self._net.state_dict(),
+                "optimiser": self._optimiser.state_dict(),
+                "log_scale": self._log_scale.detach(),
+                "step": step,
+                "generator": self._generator.get_state(),
+                "rng": json.dumps(self._rng.bit_generator.state),
+                "memories": [memory.state() for memory in self._memories],
+            },
+            part,
+        )
+        part.rename(self._checkpoint)
+
+    def share(self) -> None:
+        """Let the gradients of all processes count, and switch the network to training."""
+        self._encode = _shared(self._net, self._together, self._place)
+        self._net.train()
+
+    def step(self, step: int) -> _Step:
+        """Draw a batch of one city, compute the loss, and change the weights.
+
+        Args:
+            step: number of the step, from 0.
+        """
+        config, together = self._config, self._together
+        _set_rate(self._optimiser, config, step)
+        number = int(self._rng.integers(len(self._cities)))
+        memory = self._memories[number]
+        known, wanted = self._remembered(memory, step)
+        choice = self._cities[number].choose(config.pairs, self._rng, wanted)
+        of_queries, of_surveys = self._descriptors(self._cities[number], choice, step)
+        scale = self._log_scale.exp().clamp(max=config.largest_scale)
+        q = Side(of_queries, choice.query_xy.to(self._place))
+        m = Side(of_surveys, choice.survey_xy.to(self._place))
+        earlier = torch.from_numpy(np.setdiff1d(known, choice.pairs) if config.stale_negatives else known[:0])
+        earlier = earlier.to(self._place)
+        losses, first_ones = _LOSSES[config.loss](
+            q,
+            m,
+            scale=scale,
+            more_queries=Side(memory.queries[earlier], memory.queries_xy[earlier]),
+            more_surveys=Side(memory.surveys[earlier], memory.surveys_xy[earlier]),
+        )
+        memory.keep(choice.pairs, q.descriptors, m.descriptors, q.xy, m.xy, step)
+        loss = losses.mean()
+        self._optimiser.zero_grad(set_to_none=True)
+        loss.backward()  # type: ignore[no-untyped-call]  # torch's own stub leaves it untyped
+        together.average_gradient(self._log_scale)
+        torch.nn.utils.clip_grad_norm_(self._net.parameters(), config.gradient_norm)
+        self._optimiser.step()
+        return _Step(float(loss.detach()), float(first_ones.float().mean()), float(scale.detach()), len(choice))
+
+    def _remembered(self, memory: DescriptorMemory, step: int) -> tuple[NDArray[np.int64], NDArray[np.int64] | None]:
+        """Return pairs with recent descriptors, and hard negatives to draw; None draws without them."""
+        config = self._config
+        remembers = config.memory_after is not None and step >= config.memory_after
+        known = memory.recent(step, config.memory_steps) if remembers else np.zeros(0, np.int64)
+        if len(known) <= config.pairs:
+            return known, None
+        seeds = self._rng.choice(known, min(config.alike_seeds, len(known)), replace=False)
+        return known, self._together.of_first(memory.hard_negatives(seeds, known, config.alike_each))
+
+    def _descriptors(self, city: City, choice: Choice, step: int) -> tuple[torch.Tensor, torch.Tensor]:
+        """Return the descriptors of the queries and of the survey views of the whole batch, of all processes."""
+        config = self._config
+        bounds = shard_bounds(len(choice), config.shards)
+        planes = _own_views(city, choice, bounds, self._together, self._augment, config, step)
+        count = len(planes) // 2
+        with forward_in(config.precision, self._place.type):
+            descriptors = self._encode(planes, queries_first(planes, count))
+        descriptors = descriptors.float()
+        return self._together.gather(descriptors[:count], descriptors[count:], sizes=_sizes(bounds, self._together))
+
+    def trained(self) -> EncoderNet:
+        """Return the network in evaluation mode, with layers that need no other process."""
+        net = self._net
+        if self._together.count > 1:
+            net = EncoderNet(self._config.encoder).to(self._place)
+            net.load_state_dict(self._net.state_dict())
+        trained: EncoderNet = net.eval()
+        return trained
 
 
 def require_shards(config: TrainingConfig, processes: int) -> None:

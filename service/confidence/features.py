@@ -126,7 +126,7 @@ class Evidence:
         xy = np.array([hypothesis.position_m[:2] for hypothesis in self.hypotheses])
         rival = self.rivals(xy, np.array([hypothesis.heading_rad for hypothesis in self.hypotheses]))
         weights = np.array([hypothesis.weight for hypothesis in self.hypotheses])
-        if rival.any():
+        if rival.any() and not rival.all():
             weights = weights[rival] / weights[rival].sum()
         return float(-(weights * np.log(np.maximum(weights, 1e-12))).sum())
 
