@@ -18,7 +18,7 @@ LARGE_BYTES = 8 * 2**20
 _TRIM_AFTER_S = 0.25
 
 
-def keep_little(threads: int, *, mapped_bytes: int = MAPPED_BYTES) -> None:
+def limit_heap(threads: int, *, mapped_bytes: int = MAPPED_BYTES) -> None:
     """Limit the free memory that glibc keeps, in this process and its forks; do nothing without glibc.
 
     Args:

@@ -40,9 +40,9 @@ def encoder_rows(report: Report, city: ValidationCity, seen: dict[str, Seen]) ->
     """
     for name, each in seen.items():
         for queries in city.sets:
-            preset, likeness = queries.rpartition("_")[2], each.likeness(queries)
-            report.share(f"choices.{name}.{preset}.recall_at_1_5m", city.right(queries, likeness))
-            report.share(f"choices.{name}.{preset}.recall_at_10_5m", city.right(queries, likeness, first=10))
+            preset, similarity = queries.rpartition("_")[2], each.similarity(queries)
+            report.share(f"choices.{name}.{preset}.recall_at_1_5m", city.right(queries, similarity))
+            report.share(f"choices.{name}.{preset}.recall_at_10_5m", city.right(queries, similarity, first=10))
 
 
 def fan_rows(report: Report, city: ValidationCity, stock: Seen) -> None:
@@ -64,7 +64,7 @@ def fan_rows(report: Report, city: ValidationCity, stock: Seen) -> None:
             row = f"choices.headings.{count}_{kind}"
             report.row(f"{row}.index_mib", places * count * size * 4 / 2**20, "MiB", better="lower", n=places * count)
             for queries in city.sets:
-                right = city.right(queries, stock.likeness(queries, allowed))
+                right = city.right(queries, stock.similarity(queries, allowed))
                 report.share(f"{row}.{queries.rpartition('_')[2]}.recall_at_1_5m", right)
 
 
@@ -87,19 +87,19 @@ def neighbour_rows(report: Report, city: ValidationCity, stock: Seen) -> None:
     """
     place_street, true_street = city.streets()
     for queries in city.sets:
-        likeness = stock.likeness(queries)
-        ranked = np.argsort(-likeness, axis=1, kind="stable")
+        similarity = stock.similarity(queries)
+        ranked = np.argsort(-similarity, axis=1, kind="stable")
         known = true_street[queries] >= 0
         for k in KS:
             voted = np.array(
-                [_vote(place_street[places[:k]], of[places[:k]]) for places, of in zip(ranked, likeness, strict=True)]
+                [_vote(place_street[places[:k]], of[places[:k]]) for places, of in zip(ranked, similarity, strict=True)]
             )
             right = (voted == true_street[queries])[known]
             report.share(f"choices.k.{k}.{queries.rpartition('_')[2]}.street_accuracy", right)
 
 
-def _vote(streets: NDArray[np.int64], likeness: NDArray[np.float32]) -> int:
-    weights = similarity_weights(likeness.astype(np.float64), ClusterSettings().temperature)
+def _vote(streets: NDArray[np.int64], similarity: NDArray[np.float32]) -> int:
+    weights = similarity_weights(similarity.astype(np.float64), ClusterSettings().temperature)
     return int(np.argmax(np.bincount(streets + 1, weights))) - 1
 
 

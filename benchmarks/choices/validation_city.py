@@ -40,7 +40,7 @@ class Seen:
     views: NDArray[np.float32]
     queries: dict[str, NDArray[np.float32]]
 
-    def likeness(self, name: str, allowed: NDArray[np.bool_] | None = None) -> NDArray[np.float32]:
+    def similarity(self, name: str, allowed: NDArray[np.bool_] | None = None) -> NDArray[np.float32]:
         """Compute the similarity (Q, P) of each query's best turn to each place's best view.
 
         Args:
@@ -51,8 +51,8 @@ class Seen:
         flat = self.views.reshape(-1, size)
         best = np.empty((len(self.queries[name]), places), np.float32)
         for k, turns in enumerate(self.queries[name]):
-            likeness = (turns @ flat.T).max(axis=0).reshape(places, headings)
-            best[k] = (likeness if allowed is None else np.where(allowed, likeness, -2.0)).max(axis=1)
+            similarity = (turns @ flat.T).max(axis=0).reshape(places, headings)
+            best[k] = (similarity if allowed is None else np.where(allowed, similarity, -2.0)).max(axis=1)
         return best
 
 
@@ -140,14 +140,14 @@ class ValidationCity:
             for name in encoders
         }
 
-    def right(self, name: str, likeness: NDArray[np.float32], *, first: int = 1) -> NDArray[np.bool_]:
+    def right(self, name: str, similarity: NDArray[np.float32], *, first: int = 1) -> NDArray[np.bool_]:
         """Return for each query (Q,) whether one of the ``first`` most similar places is within 5 m.
 
         Args:
             name: name of the query set.
-            likeness: similarities (Q, P).
+            similarity: similarities (Q, P).
             first: number of places to consider.
         """
-        ranked = np.argsort(-likeness, axis=1, kind="stable")[:, :first]
+        ranked = np.argsort(-similarity, axis=1, kind="stable")[:, :first]
         away = np.linalg.norm(self.xy[ranked] - self.true_xy[name][:, None], axis=2)
         return np.asarray((away <= REACH_M).any(axis=1))

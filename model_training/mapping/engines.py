@@ -22,7 +22,7 @@ from typing import Any, Literal, get_args
 from model_training.mapping.build_tile import THREADS, TileTask, build_tile
 from service import errors
 from service.errors import BundleError, DatasetError, StreetfixError, extra_missing
-from service.heap import keep_little
+from service.heap import limit_heap
 
 Engine = Literal["local", "ray"]
 ENGINES: tuple[Engine, ...] = get_args(Engine)
@@ -130,7 +130,7 @@ def attempt(task: TileTask, on_progress: Callable[[float], None]) -> Failure | N
             last_s = time.monotonic()
             on_progress(finished)
 
-    keep_little(THREADS, mapped_bytes=_MAPPED_BYTES)
+    limit_heap(THREADS, mapped_bytes=_MAPPED_BYTES)
     try:
         build_tile(task, share)
     except StreetfixError as error:

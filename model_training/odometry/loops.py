@@ -89,11 +89,11 @@ def find_loops(
         near = np.linalg.norm(xyz - xyz[k], axis=1) < settings.slack_m + settings.drift * between
         rows = np.flatnonzero((between > settings.apart_m) & near)
         if len(rows):
-            likeness, turn = all_round(views[k], views[rows])
-            best = int(np.argmax(likeness))
-            if likeness[best] >= settings.similarity:
+            similarity, turn = all_round(views[k], views[rows])
+            best = int(np.argmax(similarity))
+            if similarity[best] >= settings.similarity:
                 loop = _proved(
-                    drive, keyframes[k], keyframes[rows[best]], int(turn[best]), float(likeness[best]), settings
+                    drive, keyframes[k], keyframes[rows[best]], int(turn[best]), float(similarity[best]), settings
                 )
                 if loop is not None:
                     loops.append(loop)

@@ -86,9 +86,9 @@ class DescriptorMemory:
         """
         rows = torch.from_numpy(among).to(self.queries.device)
         chosen = torch.from_numpy(seeds).to(self.queries.device)
-        likeness = self.queries[chosen] @ self.surveys[rows].T
-        likeness[torch.cdist(self.queries_xy[chosen], self.surveys_xy[rows]) < SAME_PLACE_M] = -2.0
-        best = likeness.topk(min(each, len(among)), dim=1).indices
+        similarity = self.queries[chosen] @ self.surveys[rows].T
+        similarity[torch.cdist(self.queries_xy[chosen], self.surveys_xy[rows]) < SAME_PLACE_M] = -2.0
+        best = similarity.topk(min(each, len(among)), dim=1).indices
         found: NDArray[np.int64] = np.unique(np.concatenate([seeds, rows[best].cpu().numpy().ravel()]))
         return found
 

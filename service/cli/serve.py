@@ -180,13 +180,13 @@ def serve(settings: "Settings") -> None:
     """
     from pydantic import SecretStr
 
-    from service.heap import keep_little
+    from service.heap import limit_heap
     from service.runtime.seal import LEAST_KEY
     from service.runtime.threads import usable_cores
 
     if not settings.maps:
         raise BundleError("there is no map to serve: streetfix serve BUNDLE, or set STREETFIX_MAPS")
-    keep_little(settings.threads or usable_cores())
+    limit_heap(settings.threads or usable_cores())
     if settings.belief_key is None:  # the workers need the same one
         settings = settings.model_copy(update={"belief_key": SecretStr(secrets.token_hex(LEAST_KEY))})
     if settings.workers == 1:

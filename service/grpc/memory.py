@@ -74,7 +74,7 @@ class MessageMemory:
         self._budget.freed(count)  # the received pieces and the joined bytes
 
     @contextmanager
-    def turn_of_others(self, *, streams: bool) -> Iterator[None]:
+    def reading_slot(self, *, streams: bool) -> Iterator[None]:
         """Wait for the turn to read one message of another service inside the context.
 
         Args:

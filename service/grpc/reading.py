@@ -146,7 +146,7 @@ class ReadingInterceptor(_Interceptor):
         def in_turn(messages: Messages, context: grpc.ServicerContext) -> Iterator[Message]:
             while True:
                 try:
-                    with self._memory.turn_of_others(streams=True), self._watchdog.time_limit(OTHERS_S, context.cancel):
+                    with self._memory.reading_slot(streams=True), self._watchdog.time_limit(OTHERS_S, context.cancel):
                         raw = next(messages, None)
                 except StreetfixError as error:
                     self._end(error, method, context)
@@ -166,7 +166,7 @@ class ReadingInterceptor(_Interceptor):
         were empty: with the health of the whole service.
         """
         try:
-            with self._memory.turn_of_others(streams=False):
+            with self._memory.reading_slot(streams=False):
                 raw = self._next(messages, method, context, OTHERS_S)
         except BusyError:
             return GetMessageClass(message)()

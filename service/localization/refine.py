@@ -125,14 +125,7 @@ def refine(
     if len(points) < settings.fewest_points:
         return None
     # 2. Starts, and registration of each from coarse to fine.
-    starts = starts_from(
-        frames,
-        prior,
-        lidar_height_m=bundle.manifest.lidar_height_m,
-        settings=settings.starts,
-        likeness=None if len(frames) == 1 else lambda T_map_level: similarity_of(bundle, measured, T_map_level)[0],
-    )
-    starts += _starts_at(bundle, measured, reference, predicted, first=len(starts))
+    starts = _starts(bundle, measured, frames, prior, predicted, settings.starts)
     found = register(cloud, points, starts, reference.views.height_m, settings.registration)
     # 3. Scores, and other local minima around the best pose.
     raycasters = Raycasters(cloud, settings.rays)
@@ -140,9 +133,8 @@ def refine(
     candidates = scorer.with_details(scorer.candidates(found))
     independent = float(np.median([frame.independent_noise for frame in frames]))
     if scorer.brightness.is_known and independent >= settings.around.from_noise:
-        near = search_locally(
-            cloud, points, candidates[0].registered, reference.views.height_m, settings.registration, settings.around
-        )
+        at, height_m = candidates[0].registered, reference.views.height_m
+        near = search_locally(cloud, points, at, height_m, settings.registration, settings.around)
         candidates[0] = scorer.select_local_optimum(candidates[0], near)
     # 4. Adjustment of the best pose along the rays, its comparison with poses next to it, and its covariance.
     noise = float(np.median([frame.noise for frame in frames]))
@@ -245,20 +237,27 @@ def _adjusted(
     return _Adjusted(pose, T_map_camera, scatter, confirmation, covariance)
 
 
-def _starts_at(
+def _starts(
     bundle: Map,
     measured: tuple[MeasuredFrame, ...],
-    reference: EncodedFrame,
+    frames: tuple[EncodedFrame, ...],
+    prior: Prior | None,
     predicted: tuple[Transform, ...],
-    *,
-    first: int,
+    settings: StartSettings,
 ) -> list[Start]:
-    """Return predicted poses T_map_camera of the reference as starts, numbered from ``first``."""
+    """Return the starts at similar views, and at the predicted poses T_map_camera of the reference."""
+    starts = starts_from(
+        frames,
+        prior,
+        lidar_height_m=bundle.manifest.lidar_height_m,
+        settings=settings,
+        similarity_at=None if len(frames) == 1 else lambda T_map_level: similarity_of(bundle, measured, T_map_level)[0],
+    )
     if not predicted:
-        return []
-    T_map_level = np.stack([reference.pose_of_level(T) for T in predicted])
+        return starts
+    T_map_level = np.stack([frames[0].pose_of_level(T) for T in predicted])
     similarity, _ = similarity_of(bundle, measured, T_map_level)
-    return [
-        Start(T[:3, :3], T[:3, 3], first + k, float(cosine))
+    return starts + [
+        Start(T[:3, :3], T[:3, 3], len(starts) + k, float(cosine))
         for k, (T, cosine) in enumerate(zip(T_map_level, similarity, strict=True))
     ]

@@ -150,7 +150,7 @@ def _answer(localizer: Localizer, frames: tuple[EncodedFrame, ...], alone: Query
         if best is not None and agrees(first, best.T_map_camera) and is_likely(calibration, frames[0], found):
             # The pose of all frames is more accurate than that of the newest one.
             return localizer.compose(used, replace(found, decision=accepted))
-        refined = alone.refined.led_by(first.T_map_camera)
+        refined = alone.refined.with_best(first.T_map_camera)
         return localizer.compose(frames[:1], replace(alone, refined=refined, decision=accepted))
     if found.decision is not None and found.decision.status == "LOCALIZED":
         doubted = Decision("AMBIGUOUS", min(found.decision.confidence, ceiling(found)), found.decision.known)

@@ -35,7 +35,7 @@ class StartSettings:
 
 
 #: Function from poses T_map_level of the reference (n, 4, 4) to the mean similarity of all frames to the map there (n,).
-Likeness = Callable[[NDArray[np.float64]], NDArray[np.float64]]
+SimilarityFunction = Callable[[NDArray[np.float64]], NDArray[np.float64]]
 
 
 def starts_from(
@@ -44,7 +44,7 @@ def starts_from(
     *,
     lidar_height_m: float,
     settings: StartSettings,
-    likeness: Likeness | None = None,
+    similarity_at: SimilarityFunction | None = None,
 ) -> list[Start]:
     """Select the most similar distinct poses of the reference's level frame.
 
@@ -53,14 +53,14 @@ def starts_from(
         prior: prior of the reference pose; None if nothing is known. Half of the starts ignore the prior, because it may be wrong.
         lidar_height_m: height of the places' LiDAR above the ground, m.
         settings: number of starts and their distance.
-        likeness: ranks the starts of several frames by their mean similarity; None for one frame. Without it, perceptual aliases of
+        similarity_at: ranks the starts of several frames by their mean similarity; None for one frame. Without it, perceptual aliases of
             single frames could crowd out the right place (decision 0071).
     """
     poses = poses_of_matches(frames, lidar_height_m)
     similarity = np.concatenate([frame.matches.similarity for frame in frames])
-    kept = _chosen(poses, similarity, prior, settings, settings.most if likeness is None else settings.pooled)
-    if likeness is not None:
-        poses, similarity = poses[kept], likeness(poses[kept])
+    kept = _chosen(poses, similarity, prior, settings, settings.most if similarity_at is None else settings.pooled)
+    if similarity_at is not None:
+        poses, similarity = poses[kept], similarity_at(poses[kept])
         kept = _chosen(poses, similarity, prior, settings, settings.most)
     # The similarity of a start excludes the prior. The support includes it later, when the rivals are registered too.
     return [Start(poses[k, :3, :3], poses[k, :3, 3], number, float(similarity[k])) for number, k in enumerate(kept)]

@@ -82,7 +82,7 @@ class MapRegistry:
             bundle = localizer.bundle
             for other in self.versions(bundle.name):
                 if other.bundle.manifest.version == bundle.manifest.version:
-                    raise twin_error(bundle.path, other.bundle.path, bundle.manifest)
+                    raise duplicate_version_error(bundle.path, other.bundle.path, bundle.manifest)
             self.mount(localizer)
 
     @classmethod
@@ -257,7 +257,7 @@ def version_of(manifest: Manifest) -> MapVersion:
     return MapVersion(manifest.name, manifest.version, _made_at(manifest))
 
 
-def twin_error(path: Path, other: Path, manifest: Manifest) -> BundleError:
+def duplicate_version_error(path: Path, other: Path, manifest: Manifest) -> BundleError:
     """Build the error for two bundles with the same version of a map.
 
     Args:

@@ -13,7 +13,7 @@ from service.localization.localizer import Localizer
 from service.maps.manifest import TILES_FOLDER, Manifest, Tile, read_manifest
 from service.maps.store.stored_map import StoredMap
 from service.maps.tiles import OPEN_BYTES, OpenSearch, TileSource, open_map
-from service.runtime.map_registry import MapRegistry, Refused, bundle_paths, twin_error, version_of
+from service.runtime.map_registry import MapRegistry, Refused, bundle_paths, duplicate_version_error, version_of
 from service.runtime.serving_table import Key, MapVersion
 from service.runtime.wakeup import Wakeup
 
@@ -385,7 +385,7 @@ class MapWatcher:
         for path, (_, manifest) in self._manifests.items():
             other = seen.setdefault(manifest_key(manifest), path)
             if other != path:
-                raise twin_error(path, other, manifest)
+                raise duplicate_version_error(path, other, manifest)
 
     def _is_refused(self, path: Path, stamp: Stamp) -> bool:
         return path in self._failed and self._failed[path][0] == stamp

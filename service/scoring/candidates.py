@@ -76,7 +76,7 @@ class Refined:
         """The best supported candidate."""
         return self.candidates[0]
 
-    def led_by(self, T_map_camera: Transform) -> "Refined":
+    def with_best(self, T_map_camera: Transform) -> "Refined":
         """Return the result with the candidate nearest to a pose as the best one.
 
         Args:

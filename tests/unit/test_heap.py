@@ -9,10 +9,10 @@ import pytest
 _PROGRAM = """
 import re, sys, threading
 from pathlib import Path
-from service.heap import Trimmer, keep_little
+from service.heap import Trimmer, limit_heap
 
 if sys.argv[1] == "kept little":
-    keep_little(1)
+    limit_heap(1)
 
 def anonymous_mib():
     return int(re.search(r"^RssAnon:\\s+(\\d+)", Path("/proc/self/status").read_text(), re.MULTILINE)[1]) / 1024

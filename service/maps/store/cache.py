@@ -59,7 +59,7 @@ class TileCache:
         Raises:
             BundleError: the folder cannot be created or read.
         """
-        with self.telling():
+        with self.error_context():
             self.folder.mkdir(parents=True, exist_ok=True)
             for folder in [*self.folder.glob("*"), *self.folder.glob(f"*/{TILES_FOLDER}")]:
                 for each in list(folder.iterdir()) if folder.is_dir() else []:
@@ -76,7 +76,7 @@ class TileCache:
         Raises:
             BundleError: the file system reports an error.
         """
-        with self.telling():
+        with self.error_context():
             make_once(target, fill)
 
     def reserve(self, partial: Path, sizes: Mapping[str, int]) -> None:
@@ -96,7 +96,7 @@ class TileCache:
                 "STREETFIX_TILE_CACHE_BYTES to several times the size of a tile",
                 field="tile_cache_bytes",
             )
-        with self.telling(), self._alone():
+        with self.error_context(), self._alone():
             self._make_room(needed)
             for name, size in sizes.items():
                 file = partial / name
@@ -114,7 +114,7 @@ class TileCache:
             folder: of a tile or of a version.
         """
         doomed = folder.parent / f".{folder.name}.{os.getpid()}-{time.monotonic_ns()}{_DELETED}"
-        with self.telling(), suppress(FileNotFoundError):  # another process deletes it too
+        with self.error_context(), suppress(FileNotFoundError):  # another process deletes it too
             folder.rename(doomed)
             shutil.rmtree(doomed, ignore_errors=True)
 
@@ -137,7 +137,7 @@ class TileCache:
             yield
 
     @contextmanager
-    def telling(self) -> Iterator[None]:
+    def error_context(self) -> Iterator[None]:
         """Turn errors of the file system inside the context into errors that name the folder and the setting.
 
         Raises:

@@ -68,7 +68,7 @@ class StoredMap:
         manifest = parsed_manifest(data, f"{self.url}/{FILE}")
         target = self.folder / manifest.version
         self._cache.once(target, partial(self._fetch_version, manifest, data))
-        with self._cache.telling():
+        with self._cache.error_context():
             if (target / FILE).read_bytes() != data:  # the same content, built again
                 newer = target / f".{FILE}.{os.getpid()}"
                 newer.write_bytes(data)
@@ -142,7 +142,7 @@ class StoreTiles:
             BundleError: the store cannot be read, a file is damaged, or the cache cannot be used.
         """
         folder = self._version.parent / tile.folder
-        with self._cache.telling():
+        with self._cache.error_context():
             is_there = is_used_now(folder)
         if not is_there:
             self._cache.once(folder, partial(self._fetch, tile))

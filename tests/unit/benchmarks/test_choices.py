@@ -19,9 +19,9 @@ def test_a_place_is_as_like_a_query_as_its_best_view_at_the_best_turn():
     views[0, 0, 0], views[1, 1, 1], views[2, 0, 2] = 1.0, 1.0, 1.0
     turns = np.array([[[0.6, 0.8, 0.0, 0.0], [0.0, 0.0, 0.9, 0.1]]], np.float32)
     seen = Seen(views, {"drive": turns})
-    np.testing.assert_allclose(seen.likeness("drive"), [[0.6, 0.8, 0.9]])
+    np.testing.assert_allclose(seen.similarity("drive"), [[0.6, 0.8, 0.9]])
     first_only = np.tile([True, False], (3, 1))
-    np.testing.assert_allclose(seen.likeness("drive", first_only), [[0.6, 0.0, 0.9]])
+    np.testing.assert_allclose(seen.similarity("drive", first_only), [[0.6, 0.0, 0.9]])
 
 
 def test_the_fixed_fan_takes_the_view_that_points_there():
@@ -31,15 +31,15 @@ def test_the_fixed_fan_takes_the_view_that_points_there():
 
 
 @pytest.mark.parametrize(
-    ("streets", "likeness", "street"),
+    ("streets", "similarity", "street"),
     [
         ([3, 1, 1], [0.90, 0.89, 0.89], 1),
         ([3, 1, 1], [0.90, 0.70, 0.70], 3),  # far less alike, they hardly count
         ([-1, -1, 2], [0.9, 0.9, 0.9], -1),  # in no street
     ],
 )
-def test_neighbours_vote_with_the_weight_of_their_likeness(streets, likeness, street):
-    assert _vote(np.array(streets), np.array(likeness, np.float32)) == street
+def test_neighbours_vote_with_the_weight_of_their_likeness(streets, similarity, street):
+    assert _vote(np.array(streets), np.array(similarity, np.float32)) == street
 
 
 def test_variations_differ_from_the_reference_in_one_thing_and_are_configurations():

@@ -512,10 +512,10 @@ def test_starts_of_several_frames_are_scored_at_the_pose_of_each_frame(bundle_at
     frames = (frame_with(matches), frame_with(matches, T_reference_camera=ahead))
     measured = measure(frames, PointSettings(), focal_baseline_px_m=80.0, is_rig=False)
 
-    def likeness(T_map_level):
+    def similarity(T_map_level):
         return similarity_of(bundle, measured, T_map_level)[0]
 
     T_map_level = np.stack([transform_from(np.eye(3), np.array([x, 0.0, 1.4])) for x in (1.0, 29.0)])
-    np.testing.assert_allclose(likeness(T_map_level), [0.05, 0.35], atol=BYTE)
+    np.testing.assert_allclose(similarity(T_map_level), [0.05, 0.35], atol=BYTE)
     turned = transform_from(rotation_z(np.pi), np.array([30.0, 0.0, 1.4]))[None]  # ahead is now at x = 20
-    np.testing.assert_allclose(likeness(turned), [0.25], atol=BYTE)
+    np.testing.assert_allclose(similarity(turned), [0.25], atol=BYTE)

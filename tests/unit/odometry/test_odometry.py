@@ -83,10 +83,10 @@ def test_a_place_that_was_turned_is_known_with_its_turn(turn):
     views = rng.normal(size=(24, 32)).astype(np.float32)
     views /= np.linalg.norm(views, axis=1, keepdims=True)
     others = np.stack([rng.normal(size=(24, 32)).astype(np.float32) / 6, np.roll(views, turn, axis=0)])
-    likeness, turns = all_round(views, others)
-    assert likeness[1] == pytest.approx(1.0, abs=1e-5)
+    similarity, turns = all_round(views, others)
+    assert similarity[1] == pytest.approx(1.0, abs=1e-5)
     assert turns[1] == turn
-    assert likeness[0] < 0.5
+    assert similarity[0] < 0.5
 
 
 #: Of a keyframe whose scan is never read.

@@ -203,7 +203,7 @@ def test_starts_of_several_frames_are_ranked_by_all_frames(matches_at, frame_wit
     """Aliases of single frames at 50 and 80 displace 10, which is second best for all frames."""
     asked = []
 
-    def likeness(T_map_level):
+    def similarity_at(T_map_level):
         asked.append(T_map_level[:, 0, 3])
         return np.where(np.abs(T_map_level[:, 0, 3] - 10) < 1, 0.85, 0.3)
 
@@ -212,7 +212,7 @@ def test_starts_of_several_frames_are_ranked_by_all_frames(matches_at, frame_wit
 
     def found(**options):
         chosen = StartSettings(most=2, less_similar=ANY_SIMILARITY, **options)
-        return starts_from((reference, ahead), None, lidar_height_m=1.8, settings=chosen, likeness=likeness)
+        return starts_from((reference, ahead), None, lidar_height_m=1.8, settings=chosen, similarity_at=similarity_at)
 
     assert x_of(found()) == [10, 80]
     assert found()[0].similarity == pytest.approx(0.85)
@@ -227,7 +227,7 @@ def test_starts_that_all_frames_find_less_like_the_map_than_the_best_start_nothi
         None,
         lidar_height_m=1.8,
         settings=StartSettings(less_similar=0.1),
-        likeness=lambda T: np.where(T[:, 0, 3] < 30, 0.8, 0.69),
+        similarity_at=lambda T: np.where(T[:, 0, 3] < 30, 0.8, 0.69),
     )
     assert x_of(found) == [10]
 
@@ -240,7 +240,7 @@ def test_a_prior_moves_starts_of_several_frames_forward_too(matches_at, frame_wi
         prior,
         lidar_height_m=1.8,
         settings=StartSettings(most=2, less_similar=ANY_SIMILARITY),
-        likeness=lambda T: np.where(T[:, 0, 3] == 50, 0.9, 0.8),
+        similarity_at=lambda T: np.where(T[:, 0, 3] == 50, 0.9, 0.8),
     )
     assert x_of(found) == [100, 50]
 
