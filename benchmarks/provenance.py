@@ -156,6 +156,8 @@ NOT_RUN: dict[str, tuple[str, ...]] = {
         "model_training/mapping/verify.py",
     )
 }
+#: Files that only some rows of a report run, by the beginning of their ids.
+ONLY_RUN_BY: dict[str, dict[str, tuple[str, ...]]] = {"accuracy": {"service/localization/tracker.py": ("filter.",)}}
 
 #: Passed checks that a change left answers equal (``benchmarks.same_answers``).
 CHECKS = ROOT / "reports" / "checks" / "same_answers.json"
@@ -200,15 +202,19 @@ def _changes_row(report: str, row_id: str, commit: str, head: str) -> bool | Non
     changed = _changed_files(commit, head)
     if changed is None:
         return None
-    return _touches(_without(changed, NOT_RUN.get(report, ())), measured_paths(report, row_id))
+    others = (file for file, rows in ONLY_RUN_BY.get(report, {}).items() if not row_id.startswith(rows))
+    return _touches(_without(changed, (*NOT_RUN.get(report, ()), *others)), measured_paths(report, row_id))
 
 
 def _is_checked(report: str, row_id: str, commit: str, head: str) -> bool:
     """Return whether checks connect the code of a row with that of ``head``. Each check connects two commits."""
-    reached, checks = (
-        [commit],
-        [each for each in _checks() if row_id.startswith(tuple(each["covered"].get(report, ())))],
-    )
+    checks = [
+        each
+        for each in _checks()
+        if row_id.startswith(tuple(each["covered"].get(report, ())))
+        and not row_id.startswith(tuple(each["not_covered"].get(report, ())))
+    ]
+    reached = [commit]
     for origin in reached:
         if _changes_row(report, row_id, origin, head) is False:
             return True

@@ -24,7 +24,7 @@ HEAD = """# Reports
 that measured the row. The reasons below a table are written by people (`benchmarks/why_missed.py`), each for the one value that it names;
 when that value has changed, the page says so instead of the reason. **Stale** means that code that the row measures has changed since the
 row's commit; any change of these files counts, a comment too. *Same answers* means that code changed, but `make same-answers` compared
-both versions: maps and answers of small cities and of drive 0005 were equal to the bit (`checks/same_answers.json`).
+both versions: maps and answers were equal to the bit. `checks/same_answers.json` names the datasets.
 *Age unknown* means that Git could not tell.
 """
 

@@ -27,7 +27,9 @@ from benchmarks.provenance import CHECKS, ROOT, git, head_commit, is_dirty, mach
 from benchmarks.real.streets import unpacked
 
 #: Beginnings of the ids of rows that a check covers, by report: answers to single queries without a prior on maps of one bundle.
-COVERED = {"accuracy": ("full.", "retrieval.", "rigs.", "height.", "ground.", "doubt.")}
+COVERED = {"accuracy": ("full.", "retrieval.", "rigs.", "ground.", "doubt.")}
+#: Beginnings of the ids of rows among them that it does not cover, because their queries have several frames.
+NOT_COVERED = {"accuracy": ("full.condition.depth_15m_sequence5", "rigs.four_cameras", "rigs.repeating")}
 #: Fields of the answers that differ between two runs of the same code.
 DURATIONS = ("ms",)
 DRIVE = "kitti_0005"
@@ -47,7 +49,8 @@ class Recording:
 
 
 _SIZE = ("--size", "120x150", "--queries", "40", "--drives", "2")
-#: Modelled depth errors; a car with matched stereo pairs and a sparse survey; a small camera with a narrow view and a short range.
+#: Modelled depth errors; a car with matched stereo pairs and a sparse survey; a small camera with a narrow view and a
+#: short range that looks down.
 SIMULATED = (
     Recording("city", ("simulate", "--seed", "7101", *_SIZE, "--depth", "precise", "--depth", "stereo")),
     Recording(
@@ -58,7 +61,7 @@ SIMULATED = (
     Recording(
         "robot",
         ("simulate", "--seed", "7103", "--city", "mixed", *_SIZE, "--lidar", "vlp_16", "--camera", "640x360", "--hfov", "69",
-         "--depth", "precise", "--set", "depth.max_range_m=12"),
+         "--pitch", "20", "--depth", "precise", "--set", "depth.max_range_m=12"),
     ),
 )  # fmt: skip
 
@@ -110,17 +113,24 @@ class Version:
         environment = os.environ | {"PYTHONPATH": os.pathsep.join(map(str, (self._folder, first)))}
         subprocess.run([sys.executable, "-c", code, *arguments], cwd=self._folder, env=environment, check=True)
 
-    def answers(self, recording: Recording) -> Path:
+    def answers(self, recording: Recording, other: Path | None = None) -> Path:
         """Make a dataset, build its map and answer its queries; return the folder of the map and the answers.
+
+        The queries are answered with and without registration, and on the map of another dataset.
 
         Args:
             recording: the dataset.
+            other: folder of another dataset, as this method returns it.
         """
         folder = self.work / recording.name
-        data, bundle, answers = (str(folder / name) for name in ("data", "map", "answers"))
+        data, bundle = str(folder / "data"), str(folder / "map")
         self.run(*recording.options, "--out", data)
         self.run("build-map", data, "--out", bundle)
-        self.run("evaluate", bundle, data, "--predictions", answers, "--list", "0")
+        asked = {"answers": (bundle, "--refine"), "retrieved": (bundle, "--no-refine")}
+        if other is not None:
+            asked["outside"] = (str(other / "map"), "--refine")
+        for name, (path, refine) in asked.items():
+            self.run("evaluate", path, data, refine, "--predictions", str(folder / name), "--list", "0")
         return folder
 
 
@@ -138,17 +148,16 @@ def compare(before: Path, after: Path) -> int:
     for name in sorted(files[0].keys() | files[1].keys()):
         if files[0].get(name) != files[1].get(name):
             raise DifferentAnswersError(f"{after.name}: the map's file {name} differs")
-    names = [sorted(path.name for path in (folder / "answers").glob("*.npz")) for folder in (before, after)]
+    names = [sorted(str(path.relative_to(folder)) for path in folder.glob("*/*.npz")) for folder in (before, after)]
     if names[0] != names[1] or not names[0]:
         raise DifferentAnswersError(f"{after.name}: query sets {names[0]} and {names[1]}")
     count = 0
     for name in names[0]:
-        with np.load(before / "answers" / name) as one, np.load(after / "answers" / name) as other:
+        with np.load(before / name) as one, np.load(after / name) as other:
             if set(one.files) != set(other.files):
                 raise DifferentAnswersError(f"{after.name}/{name}: fields {sorted(set(one.files) ^ set(other.files))}")
             for field in sorted(set(one.files) - set(DURATIONS)):
-                numbers = one[field].dtype.kind == "f"
-                if not np.array_equal(one[field], other[field], equal_nan=numbers):
+                if one[field].dtype != other[field].dtype or one[field].tobytes() != other[field].tobytes():
                     raise DifferentAnswersError(f"{after.name}/{name}: {field} differs")
             count += len(one["T_true"])
     return count
@@ -192,6 +201,7 @@ def record(before: str, after: str, queries: dict[str, int]) -> dict[str, Any]:
         "machine": machine(),
         "queries": queries,
         "covered": {report: list(beginnings) for report, beginnings in COVERED.items()},
+        "not_covered": {report: list(beginnings) for report, beginnings in NOT_COVERED.items()},
     }
 
 
@@ -209,29 +219,34 @@ def main(arguments: Sequence[str] | None = None) -> int:
     given = parser.parse_args(arguments)
     if is_dirty():
         parser.error("the code differs from HEAD; commit first, so that the record can name what it compared")
-    before = git("rev-parse", f"{given.before}^{{commit}}") or given.before
+    before, after = git("rev-parse", f"{given.before}^{{commit}}") or given.before, head_commit()
     with tempfile.TemporaryDirectory(prefix="same_answers_") as name:
-        work = Path(name)
+        work, tree = Path(name), Path(name, "before")
         try:
-            tree = work_tree(before, work / "before")
-        except ValueError as error:
-            parser.error(str(error))
-        try:
+            work_tree(before, tree)
             recordings = [*SIMULATED, *_real(given.data, work)]
             older, newer = Version(tree, work / "answers_before"), Version(ROOT, work / "answers_after")
             queries: dict[str, int] = {}
+            last: tuple[Path | None, Path | None] = (None, None)
             for number, recording in enumerate(recordings):
                 print(f"--- {recording.name} ({number + 1} of {len(recordings)})", flush=True)
-                queries[recording.name] = compare(older.answers(recording), newer.answers(recording))
+                last = older.answers(recording, last[0]), newer.answers(recording, last[1])
+                queries[recording.name] = compare(*last)
                 print(f"{recording.name}: {queries[recording.name]} equal answers", flush=True)
+        except ValueError as error:
+            parser.error(str(error))
         except DifferentAnswersError as difference:
             print(f"different: {difference}")
             return 1
         finally:
             git("worktree", "remove", "--force", str(tree))
+            git("worktree", "prune")
+    if head_commit() != after or is_dirty():
+        print("the code changed during the check; start it again")
+        return 1
     CHECKS.parent.mkdir(parents=True, exist_ok=True)
     kept = json.loads(CHECKS.read_text()) if CHECKS.exists() else []
-    CHECKS.write_text(json.dumps([*kept, record(before, head_commit(), queries)], indent=1) + "\n")
+    CHECKS.write_text(json.dumps([*kept, record(before, after, queries)], indent=1) + "\n")
     print(f"written: {CHECKS.relative_to(ROOT)}")
     return 0
 

@@ -85,6 +85,8 @@ def follow(
         )
         belief = track.belief.moved(T_previous_camera, std=odometry_std)
         last = None if track.last is None else moved(track.last, T_previous_camera, odometry_std)
+    if belief.born and frame.query.prior is not None:  # a prior counts once, in the first frame of a track
+        frame = replace(frame, query=replace(frame.query, prior=None))
     bundle = localizer.bundle
     is_calibrated = bundle.cloud is not None and bundle.calibration is not None
     if not frame.query.refine or not is_calibrated:  # the frame has no probability

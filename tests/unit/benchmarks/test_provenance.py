@@ -56,6 +56,13 @@ def test_a_file_that_no_row_of_the_report_runs_does_not_count(repository, monkey
     assert ages([third], commit("service/maps/tiles.pyi", "1"), "map") == [True]
 
 
+def test_a_file_that_only_some_rows_run_counts_for_these(repository, monkeypatch):
+    (_, _, third), commit = repository
+    monkeypatch.setitem(provenance.ONLY_RUN_BY, "mine", {"service/maps/track.py": ("track.",)})
+    monkeypatch.setitem(MEASURED["mine"], "track.", ("service/maps",))
+    assert ages([third], commit("service/maps/track.py", "1"), "map", "track.a") == [None, True]
+
+
 def test_code_that_was_changed_back_is_the_same(repository):
     (first, _, _), commit = repository
     assert ages([first], commit("service/maps/a.py", "1"), "map") == [None]
@@ -74,16 +81,18 @@ def test_a_check_that_answers_are_equal_connects_two_versions(repository, tmp_pa
     checks = tmp_path / "checks.json"
     monkeypatch.setattr(provenance, "CHECKS", checks)
     fourth = commit("service/maps/a.py", "4")
-    covered = {"mine": ["map."]}
+    covered, but_not = {"mine": ["map."]}, {"mine": ["map.frames"]}
 
     def checked(*pairs):
-        checks.write_text(json.dumps([{"before": one, "after": other, "covered": covered} for one, other in pairs]))
+        kept = [{"before": one, "after": other, "covered": covered, "not_covered": but_not} for one, other in pairs]
+        checks.write_text(json.dumps(kept))
         return ages([first], fourth, "map.a", "other")
 
     assert checked((first, second)) == [True, True]  # the change after the check is not compared
     assert checked((third, fourth)) == [True, True]  # nor is the one before it
     assert checked((first, second), (third, fourth)) == ["same answers", True]
     assert checked((first, fourth)) == ["same answers", True]
+    assert ages([first], fourth, "map.frames") == [True]
     covered["mine"], covered["another"] = ["all."], ["map."]
     assert checked((first, fourth)) == [True, True]
 

@@ -33,11 +33,11 @@ def test_equal_answers_are_counted_and_durations_do_not_matter(tmp_path):
     ("change", "what"),
     [
         ({"cloud": "bb"}, "city: the map's file cloud differs"),
-        ({"status": "AMBIGUOUS"}, "city/drive1.npz: status differs"),
-        ({"confidence": 0.1}, "city/drive1.npz: confidence differs"),
+        ({"status": "AMBIGUOUS"}, "city/answers/drive1.npz: status differs"),
+        ({"confidence": 0.1}, "city/answers/drive1.npz: confidence differs"),
         ({"sets": ("drive2",)}, "city: query sets"),
         ({"sets": ()}, "city: query sets"),
-        ({"candidates": np.zeros(2)}, r"city/drive1.npz: fields \['candidates'\]"),
+        ({"candidates": np.zeros(2)}, r"city/answers/drive1.npz: fields \['candidates'\]"),
     ],
 )
 def test_the_first_difference_is_named(tmp_path, change, what):
@@ -68,7 +68,7 @@ def test_changes_that_are_not_committed_are_refused(monkeypatch, capsys):
 
 @pytest.mark.parametrize(("changed", "what"), [(None, "is not a commit"), ("native/build.ninja", "does not compile")])
 def test_an_unknown_commit_and_other_c_code_are_refused(monkeypatch, capsys, changed, what):
-    answers = {"rev-parse": "f" * 40, "cat-file": None if changed is None else "", "diff": changed}
+    answers = {"rev-parse": "f" * 40, "cat-file": None if changed is None else "", "diff": changed, "worktree": ""}
     monkeypatch.setattr(same_answers, "is_dirty", lambda: False)
     monkeypatch.setattr(same_answers, "git", lambda command, *_: answers[command])
     with pytest.raises(SystemExit):
@@ -87,7 +87,7 @@ def test_a_difference_fails_and_leaves_no_record(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(same_answers, "work_tree", lambda _, folder: folder)
     monkeypatch.setattr(same_answers, "head_commit", lambda: "e" * 40)
     monkeypatch.setattr(same_answers, "SIMULATED", same_answers.SIMULATED[:1])
-    monkeypatch.setattr(Version, "answers", lambda version, _: found[version.work.name.removeprefix("answers_")])
+    monkeypatch.setattr(Version, "answers", lambda version, *_: found[version.work.name.removeprefix("answers_")])
     arguments = ["--before", "HEAD", "--data", str(tmp_path)]
     assert main(arguments) == 1
     assert "the map's file cloud differs" in capsys.readouterr().out
@@ -96,6 +96,20 @@ def test_a_difference_fails_and_leaves_no_record(tmp_path, monkeypatch, capsys):
     assert main(arguments) == 0
     (kept,) = json.loads(checks.read_text())
     assert (kept["before"], kept["after"], kept["queries"]) == ("f" * 40, "e" * 40, {"city": 2})
+
+
+def test_a_commit_during_the_check_leaves_no_record(tmp_path, monkeypatch, capsys):
+    """The record would name code that was not compared."""
+    commits = iter(["e" * 40, "d" * 40])
+    monkeypatch.setattr(same_answers, "CHECKS", tmp_path / "same_answers.json")
+    monkeypatch.setattr(same_answers, "is_dirty", lambda: False)
+    monkeypatch.setattr(same_answers, "git", lambda *_: "f" * 40)
+    monkeypatch.setattr(same_answers, "head_commit", lambda: next(commits))
+    monkeypatch.setattr(same_answers, "work_tree", lambda _, folder: folder)
+    monkeypatch.setattr(same_answers, "SIMULATED", ())
+    assert main(["--before", "HEAD", "--data", str(tmp_path)]) == 1
+    assert "start it again" in capsys.readouterr().out
+    assert not (tmp_path / "same_answers.json").exists()
 
 
 def test_the_command_has_help():

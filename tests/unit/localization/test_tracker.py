@@ -13,7 +13,7 @@ from service.confidence.decision import Decision, Status
 from service.confidence.features import FEATURES
 from service.geometry.rigid import transform_from
 from service.localization import agreement
-from service.localization.belief import KIDNAPPED, KIDNAPPED_ON_THE_WAY, NEW_M
+from service.localization.belief import KIDNAPPED, KIDNAPPED_ON_THE_WAY, NEW_M, Belief
 from service.localization.compose import QueryResult
 from service.localization.localizer import Localizer
 from service.localization.track_bytes import MOST_BYTES, packed, unpacked
@@ -199,19 +199,34 @@ def test_frames_of_one_position_are_not_registered_together(localizer, frame):
 
 
 def test_a_prior_counts_once(localizer, frame, monkeypatch):
-    """The first frame uses its decision with the prior. Later frames decide again without it."""
+    """The registration of the first frame uses the prior. Those of later frames do not: one frame alone, and several together."""
     in_range(monkeypatch)
-    monkeypatch.setattr(agreement, "decision_of", lambda *_: Decision("AMBIGUOUS", 0.1, 0.2))
     asked = replace(frame, query=replace(frame.query, prior=Prior(position_m=np.zeros(2))))
     scripted = Scripted(
         localizer.answer((frame,)), [found(0.8, (2.0 * k, 0.99)) for k in range(2)], found(0.5, (2.0, 0.9))
     )
-    first, track = follow(scripted, asked, Track(), None)
-    second, _ = follow(scripted, asked, track, AHEAD)
-    assert first.belief is not None
-    assert second.belief is not None
-    assert first.belief.modes[0].weight == pytest.approx(0.8)
-    assert second.belief.modes[0].weight < 0.85  # 0.97 if the prior counted again
+    priors = []
+    register = scripted.register
+    scripted.register = lambda frames, *more: (priors.append(frames[0].query.prior), register(frames, *more))[1]  # type: ignore[method-assign]
+    _, track = follow(scripted, asked, Track(), None)
+    follow(scripted, asked, track, AHEAD)
+    assert priors[0] is asked.query.prior
+    assert len(priors) == 3
+    assert priors[1:] == [None, None]
+
+
+def test_a_belief_with_frames_takes_no_prior(localizer, frame, monkeypatch):
+    """``updated_belief`` decides again without the prior, whoever calls it."""
+    in_range(monkeypatch)
+    decided = []
+    monkeypatch.setattr(agreement, "decision_of", lambda _, query, *__: decided.append(query.prior))
+    asked = replace(frame, query=replace(frame.query, prior=Prior(position_m=np.zeros(2))))
+    alone = found(0.8, (0.0, 0.99))
+    belief = agreement.updated_belief(calibration(THRESHOLD), asked, alone, Belief())
+    assert decided == []
+    assert belief.modes[0].weight == pytest.approx(0.8)
+    agreement.updated_belief(calibration(THRESHOLD), asked, alone, belief)
+    assert decided == [None]
 
 
 def test_a_frame_without_registration_keeps_the_belief(localizer, frame, monkeypatch):
