@@ -38,7 +38,6 @@ from service.retrieval.encoder import Encoder
 
 #: Progress callback: stage, finished steps, all steps.
 Report = Callable[[str, int, int], None]
-#: Start of the name of a tile's folder among the parts of an update.
 #: Parameters of a tile that count something.
 _COUNTED = ("survey_scans", "places_between")
 
