@@ -156,8 +156,12 @@ NOT_RUN: dict[str, tuple[str, ...]] = {
         "model_training/mapping/verify.py",
     )
 }
+NOT_RUN["real_data"] = tuple(file for file in NOT_RUN["accuracy"] if file.startswith("model_training/"))
 #: Files that only some rows of a report run, by the beginning of their ids.
-ONLY_RUN_BY: dict[str, dict[str, tuple[str, ...]]] = {"accuracy": {"service/localization/tracker.py": ("filter.",)}}
+ONLY_RUN_BY: dict[str, dict[str, tuple[str, ...]]] = {
+    "accuracy": {"service/localization/tracker.py": ("filter.",)},
+    "real_data": {"service/localization/tracker.py": ("real.track.", "ros2.")},
+}
 
 #: Passed checks that a change left answers equal (``benchmarks.same_answers``).
 CHECKS = ROOT / "reports" / "checks" / "same_answers.json"
