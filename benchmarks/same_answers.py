@@ -95,8 +95,7 @@ class Version:
             *arguments: arguments of the command.
 
         Raises:
-            RuntimeError: the code of another folder would run.
-            subprocess.CalledProcessError: the command failed.
+            subprocess.CalledProcessError: the command failed, or the code of another folder would have run.
         """
         code = (
             "import pathlib, sys, service, model_training\n"
@@ -135,7 +134,7 @@ class Version:
 
 
 def compare(before: Path, after: Path) -> int:
-    """Compare the maps and the answers of two versions; return the number of queries.
+    """Compare the maps and the answers of two versions; return the number of answers.
 
     Args:
         before: folder of ``Version.answers``.
@@ -163,8 +162,8 @@ def compare(before: Path, after: Path) -> int:
     return count
 
 
-def work_tree(commit: str, folder: Path) -> Path:
-    """Check out a commit beside this one, with the compiled code of this one; return its folder.
+def work_tree(commit: str, folder: Path) -> None:
+    """Check out a commit beside this one, with the compiled code of this one.
 
     Args:
         commit: the commit.
@@ -183,7 +182,6 @@ def work_tree(commit: str, folder: Path) -> Path:
     for package in ("service", "model_training"):
         for library in (ROOT / package).rglob("*.so"):
             shutil.copy(library, folder / library.relative_to(ROOT))
-    return folder
 
 
 def record(before: str, after: str, queries: dict[str, int]) -> dict[str, Any]:
@@ -192,7 +190,7 @@ def record(before: str, after: str, queries: dict[str, int]) -> dict[str, Any]:
     Args:
         before: commit of the older version.
         after: commit of the newer version.
-        queries: number of compared queries of each dataset.
+        queries: number of compared answers of each dataset.
     """
     return {
         "before": before,
@@ -224,7 +222,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         work, tree = Path(name), Path(name, "before")
         try:
             work_tree(before, tree)
-            recordings = [*SIMULATED, *_real(given.data, work)]
+            recordings = [*SIMULATED, *_real(given.data.resolve(), work)]
             older, newer = Version(tree, work / "answers_before"), Version(ROOT, work / "answers_after")
             queries: dict[str, int] = {}
             last: tuple[Path | None, Path | None] = (None, None)

@@ -84,7 +84,7 @@ def test_a_difference_fails_and_leaves_no_record(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(same_answers, "CHECKS", checks)
     monkeypatch.setattr(same_answers, "is_dirty", lambda: False)
     monkeypatch.setattr(same_answers, "git", lambda *_: "f" * 40)
-    monkeypatch.setattr(same_answers, "work_tree", lambda _, folder: folder)
+    monkeypatch.setattr(same_answers, "work_tree", lambda *_: None)
     monkeypatch.setattr(same_answers, "head_commit", lambda: "e" * 40)
     monkeypatch.setattr(same_answers, "SIMULATED", same_answers.SIMULATED[:1])
     monkeypatch.setattr(Version, "answers", lambda version, *_: found[version.work.name.removeprefix("answers_")])
@@ -105,7 +105,7 @@ def test_a_commit_during_the_check_leaves_no_record(tmp_path, monkeypatch, capsy
     monkeypatch.setattr(same_answers, "is_dirty", lambda: False)
     monkeypatch.setattr(same_answers, "git", lambda *_: "f" * 40)
     monkeypatch.setattr(same_answers, "head_commit", lambda: next(commits))
-    monkeypatch.setattr(same_answers, "work_tree", lambda _, folder: folder)
+    monkeypatch.setattr(same_answers, "work_tree", lambda *_: None)
     monkeypatch.setattr(same_answers, "SIMULATED", ())
     assert main(["--before", "HEAD", "--data", str(tmp_path)]) == 1
     assert "start it again" in capsys.readouterr().out
