@@ -9,7 +9,7 @@ from functools import cached_property
 from typing import Literal
 
 import numpy as np
-from jaxtyping import Bool, Float64
+from jaxtyping import Float64
 from numpy.typing import NDArray
 
 from service.confidence.shape import Shape, shape_of
@@ -17,7 +17,7 @@ from service.errors import BundleError
 from service.geometry.rigid import heading_of_camera
 from service.imaging.view_grid import ViewGrid
 from service.maps.calibration import Calibration
-from service.retrieval.hypotheses import Hypothesis
+from service.retrieval.hypotheses import ClusterSettings, Hypothesis
 from service.retrieval.knn import Neighbour
 from service.retrieval.retrieve import EncodedFrame
 from service.scoring.candidates import Candidate, Refined, distinct_candidates, log_shares, support_gaps
@@ -29,9 +29,8 @@ _NEAREST = 5  # number of the most similar neighbours in ``pose_spread``
 _MOST_MARGIN = 12.0  # nats; largest margin, also used if there is no rival
 _MOST_PLACE_M = 10.0
 _LONE_ADVANTAGE = 0.3  # a typical value of right answers
-#: A pose whose log weight by the prior is lower than that of the answer by this much is no rival, nats (decision 0135). A prior lowers a
-#: log weight by 5 nats at most, so it excludes rivals only if it agrees with the answer.
-EXCLUDED_NATS = 4.0
+#: Difference in similarity that counts as much as one nat of the prior (decision 0183).
+_SIMILARITY_PER_NAT = ClusterSettings().temperature
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,10 +75,12 @@ class Evidence:
         xy = self.best.T_map_camera[:2, 3]
         return np.array([np.hypot(*(place.position_m[:2] - xy)) for place in self.neighbours])
 
-    def rivals(
+    def excluded_nats(
         self, xy: Float64[NDArray[np.float64], "n 2"], heading_rad: Float64[NDArray[np.float64], " n"]
-    ) -> Bool[NDArray[np.bool_], " n"]:
-        """Return whether the query's prior allows each pose beside the answer (n,). Without a prior all are allowed.
+    ) -> Float64[NDArray[np.float64], " n"]:
+        """Return how much less the query's prior allows each pose than the answer (n,), nats; 0 for a pose that it allows as much or more.
+
+        A place that the prior excludes is no rival of the answer (decision 0183). Without a prior the result is 0.
 
         Args:
             xy: positions, map frame, metres.
@@ -87,26 +88,35 @@ class Evidence:
         """
         prior = self.frames[0].query.prior
         if prior is None:
-            return np.ones(len(xy), np.bool_)
+            return np.zeros(len(xy))
         T = self.best.T_map_camera
         answer = float(prior.log_weight(T[None, :2, 3], np.array([heading_of_camera(T)]))[0])
-        return np.asarray(prior.log_weight(xy, heading_rad) > answer - EXCLUDED_NATS)
+        return np.maximum(answer - prior.log_weight(xy, heading_rad), 0.0)
 
     @property
     def inlier_advantage(self) -> float:
-        """Inliers of the best candidate minus the median of its rivals; ``_LONE_ADVANTAGE`` without rivals."""
-        others = distinct_candidates(self.refined.candidates)[1:]
-        xy = np.array([other.T_map_camera[:2, 3] for other in others]).reshape(-1, 2)
-        rival = self.rivals(xy, np.array([heading_of_camera(other.T_map_camera) for other in others]))
-        inliers = np.array([other.registered.inliers for other in others])[rival]
-        return self.best.registered.inliers - float(np.median(inliers)) if len(inliers) else _LONE_ADVANTAGE
+        """Inliers of the best candidate minus the median of its rivals; ``_LONE_ADVANTAGE`` without rivals.
+
+        A prior moves the inliers of an excluded rival to the value that stands for no rival.
+        """
+        best, others = self.best.registered.inliers, distinct_candidates(self.refined.candidates)[1:]
+        if not others:
+            return _LONE_ADVANTAGE
+        xy = np.array([other.T_map_camera[:2, 3] for other in others])
+        allowed = np.exp(-self.excluded_nats(xy, np.array([heading_of_camera(other.T_map_camera) for other in others])))
+        inliers = np.array([other.registered.inliers for other in others])
+        return best - float(np.median(allowed * inliers + (1 - allowed) * (best - _LONE_ADVANTAGE)))
 
     @property
     def similarity_margin(self) -> float:
-        """Similarity of the best candidate minus that of the most similar neighbour elsewhere, times the root of the frames."""
+        """Similarity of the best candidate minus that of the most similar neighbour elsewhere, times the root of the frames.
+
+        A prior lowers the similarity of an excluded neighbour.
+        """
         xy = np.array([place.position_m[:2] for place in self.neighbours])
-        rival = self.rivals(xy, np.array([place.heading_rad for place in self.neighbours]))
-        elsewhere = np.array([place.similarity for place in self.neighbours])[rival & (self.away_m > OTHER_PLACE_M)]
+        excluded = self.excluded_nats(xy, np.array([place.heading_rad for place in self.neighbours]))
+        similarity = np.array([place.similarity for place in self.neighbours]) - _SIMILARITY_PER_NAT * excluded
+        elsewhere = similarity[self.away_m > OTHER_PLACE_M]
         other = float(elsewhere.max()) if len(elsewhere) else 0.5
         return float(np.sqrt(len(self.frames))) * (self.best.scores["similarity"] - other)
 
@@ -122,12 +132,13 @@ class Evidence:
 
     @property
     def entropy(self) -> float:
-        """Entropy of the weights of the clusters that the prior allows, nats; of all clusters if it allows none."""
+        """Entropy of the weights of the clusters, nats. A prior lowers the weight of an excluded cluster."""
         xy = np.array([hypothesis.position_m[:2] for hypothesis in self.hypotheses])
-        rival = self.rivals(xy, np.array([hypothesis.heading_rad for hypothesis in self.hypotheses]))
         weights = np.array([hypothesis.weight for hypothesis in self.hypotheses])
-        if rival.any() and not rival.all():
-            weights = weights[rival] / weights[rival].sum()
+        if self.frames[0].query.prior is not None:
+            heading_rad = np.array([hypothesis.heading_rad for hypothesis in self.hypotheses])
+            weights = weights * np.exp(-self.excluded_nats(xy, heading_rad))
+            weights /= weights.sum()
         return float(-(weights * np.log(np.maximum(weights, 1e-12))).sum())
 
     @property

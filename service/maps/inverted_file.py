@@ -48,6 +48,10 @@ _QUERIES, _LISTED, _BEST = 128, 1_440, 10
 _NOISE = 0.6
 #: Recall to reach, and factor by which the number of lists that a search reads grows until then.
 _WANTED, _GROWTH = 0.992, 2**0.5
+#: Twice the lists that raise the recall by less than this are not worth their time: the shortlist is too short, or the graph misses lists.
+_LEAST_GAIN = 0.002
+#: The shortlist of a map with more than ``SMALLEST`` views is longer by (views / ``SMALLEST``) to this power (decision 0158).
+_LENGTH_POWER = 0.6
 _QueryDescriptors = Float32[NDArray[np.float32], "q D"]
 #: FAISS without its type stubs, which lack many of the classes and fields that this file uses.
 _faiss: Any = faiss
@@ -78,6 +82,19 @@ def lists_for(views: int) -> int:
         views: number of views, 1 or more.
     """
     return int(2 ** max(0, round(np.log2(8 * np.sqrt(views)))))
+
+
+def longer_list(k: int, views: int) -> int:
+    """Return how many views a search lists by their codes.
+
+    In a larger map, more views are about as similar as the best ones, and their codes do not order them.
+
+    Args:
+        k: length of the list in a map of ``SMALLEST`` views or fewer, at most the number of views.
+        views: number of views of the map.
+    """
+    times = float(max(views / SMALLEST, 1.0) ** _LENGTH_POWER)
+    return min(round(k * times), views)
 
 
 class InvertedFile:
@@ -138,10 +155,10 @@ class InvertedFile:
 
         Args:
             descriptor: descriptor of the query view.
-            k: length of the list, at most the number of views.
+            k: length of the list, at most the number of views. The list of a map beyond ``SMALLEST`` views is longer.
         """
-        found = self._by_codes(descriptor, k)
-        return np.union1d(found, self._neighbours(found[: -(-k // _BRING)]))
+        found = self._by_codes(descriptor, longer_list(k, self._lists.ntotal))
+        return np.union1d(found, self._neighbours(found[: -(-len(found) // _BRING)]))
 
     def most_similar(self, descriptor: Float32[NDArray[np.float32], " D"], k: int) -> Int64[NDArray[np.int64], " n"]:
         """Return the indices of about the k most similar views, the most similar first.
@@ -224,7 +241,7 @@ def _add(whole: Any, numbers: Rows) -> None:
 
 
 def _choose_probes(whole: Any, numbers: Rows, headings: int) -> float:
-    """Set about the smallest number of probes that reaches the recall wanted; return the recall.
+    """Set about the smallest number of probes that reaches the recall wanted, or that more probes hardly improve; return the recall.
 
     Args:
         whole: index of all views.
@@ -234,13 +251,19 @@ def _choose_probes(whole: Any, numbers: Rows, headings: int) -> float:
     queries = _queries(numbers)
     tenth = _tenth_best(numbers, queries)
     inverted, opened = _faiss.downcast_index(whole.index), InvertedFile(whole, headings)
-    probes = 1.0
+    # Fewer lists do not hold the shortlist. A search then reads more of them, so their recall shows no plateau.
+    enough = 2 * longer_list(min(_LISTED, len(numbers)), len(numbers)) * inverted.nlist / len(numbers)
+    tried: list[tuple[int, float]] = []
     while True:
-        inverted.nprobe = min(round(probes), inverted.nlist)
+        inverted.nprobe = min(round(_GROWTH ** len(tried)), inverted.nlist)
         recall = recall_of(opened, numbers, queries, tenth)
+        tried.append((inverted.nprobe, recall))
         if recall >= _WANTED or inverted.nprobe == inverted.nlist:
             return recall
-        probes *= _GROWTH
+        half_probes, half_recall = tried[max(len(tried) - 3, 0)]
+        if half_probes >= enough and recall - half_recall < _LEAST_GAIN:
+            inverted.nprobe = half_probes
+            return half_recall
 
 
 def recall_of(opened: Shortlister, numbers: Rows, queries: _QueryDescriptors, tenth: NDArray[np.float32]) -> float:

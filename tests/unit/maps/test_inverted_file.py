@@ -19,7 +19,7 @@ from service.errors import BundleError
 from service.maps import inverted_file
 from service.maps.content import BundleContent
 from service.maps.index import ScannedCopy, read_descriptors, vectors_of, write_descriptors
-from service.maps.inverted_file import FILE, RECALL, InvertedFile, lists_for, write_inverted_file
+from service.maps.inverted_file import FILE, RECALL, InvertedFile, lists_for, longer_list, write_inverted_file
 from service.maps.manifest import Manifest
 from service.maps.reader import MapBundle
 from service.maps.writer import sha256_of, write_bundle
@@ -69,6 +69,40 @@ def large(content_of: Callable[..., BundleContent]) -> BundleContent:
 )
 def test_the_number_of_lists_follows_the_root_of_the_number_of_views(views: int, lists: int) -> None:
     assert lists_for(views) == lists
+
+
+# 48.9^0.6 = 10.318, and 32^0.6 = 8.
+@pytest.mark.parametrize(
+    ("k", "views", "length"),
+    [(1440, 1_000_000, 1440), (1440, 5000, 1440), (100, 32_000_000, 800), (1440, 48_900_000, 14_858), (7, 7, 7)],
+)
+def test_a_larger_map_lists_more_views(k: int, views: int, length: int) -> None:
+    assert longer_list(k, views) == length
+
+
+@pytest.mark.parametrize(
+    ("recalls", "probes", "recall"),
+    [
+        # probes 1, 1, 2, 3, 4, 6, 8, 11, 16, 23, 32, ...: 512 lists of about six views, so 20 listed views are in about 3.4 lists
+        ([0.1, 0.1, 0.1, 0.1, 0.1, 0.5, 0.7, 0.9, 0.95, 0.993], 23, 0.993),
+        ([0.1, 0.1, 0.1, 0.1, 0.1, 0.5, 0.7, 0.9, 0.95, 0.9505, 0.9515], 16, 0.95),  # 32 lists gain 0.0015 over 16
+        ([0.1, 0.1, 0.1, 0.1, 0.1, 0.5, 0.7, 0.9, 0.95, 0.9505, 0.953, 0.9925], 45, 0.9925),  # 0.003
+    ],
+)
+def test_the_build_stops_where_more_lists_find_no_more(
+    written: SimpleNamespace,
+    monkeypatch: pytest.MonkeyPatch,
+    recalls: list[float],
+    probes: int,
+    recall: float,
+) -> None:
+    whole = faiss.read_index(str(written.path))
+    lists = faiss.downcast_index(whole.index)
+    given_recalls = iter(recalls)
+    monkeypatch.setattr(inverted_file, "_LISTED", 20)
+    monkeypatch.setattr(inverted_file, "recall_of", lambda *_: next(given_recalls))
+    assert inverted_file._choose_probes(whole, written.numbers, HEADINGS) == recall
+    assert lists.nprobe == probes
 
 
 def test_a_shortlist_holds_the_most_similar_views(written: SimpleNamespace, opened: InvertedFile) -> None:
