@@ -33,8 +33,8 @@ _OUTLIERS = 0.005
 _LINKS = 32
 #: Fewest candidates of a search in the graph. More find nearer centroids and take longer.
 _LEAST_CANDIDATES = 64
-#: The first 1 / _BRING of a list brings its neighbours into the exact search: the views of up to _PLACES places before and after
-#: in the survey, at up to _TURNS headings to each side.
+#: The first k / _BRING of a list for k views bring their neighbours into the exact search: the views of up to _PLACES places before and
+#: after in the survey, at up to _TURNS headings to each side.
 _BRING, _PLACES, _TURNS = 3, 2, 1
 #: Steps of k-means, and views for each centroid that it takes into account.
 _STEPS, _VIEWS_PER_LIST = 6, 16
@@ -51,7 +51,7 @@ _WANTED, _GROWTH = 0.992, 2**0.5
 #: Twice the lists that raise the recall by less than this are not worth their time: the shortlist is too short, or the graph misses lists.
 _LEAST_GAIN = 0.002
 #: The shortlist of a map with more than ``SMALLEST`` views is longer by (views / ``SMALLEST``) to this power (decision 0158).
-_LENGTH_POWER = 0.6
+_LENGTH_POWER = 0.75
 _QueryDescriptors = Float32[NDArray[np.float32], "q D"]
 #: FAISS without its type stubs, which lack many of the classes and fields that this file uses.
 _faiss: Any = faiss
@@ -158,7 +158,7 @@ class InvertedFile:
             k: length of the list, at most the number of views. The list of a map beyond ``SMALLEST`` views is longer.
         """
         found = self._by_codes(descriptor, longer_list(k, self._lists.ntotal))
-        return np.union1d(found, self._neighbours(found[: -(-len(found) // _BRING)]))
+        return np.union1d(found, self._neighbours(found[: -(-k // _BRING)]))
 
     def most_similar(self, descriptor: Float32[NDArray[np.float32], " D"], k: int) -> Int64[NDArray[np.int64], " n"]:
         """Return the indices of about the k most similar views, the most similar first.

@@ -71,10 +71,10 @@ def test_the_number_of_lists_follows_the_root_of_the_number_of_views(views: int,
     assert lists_for(views) == lists
 
 
-# 48.9^0.6 = 10.318, and 32^0.6 = 8.
+# 48.9^0.75 = 18.492, and 16^0.75 = 8.
 @pytest.mark.parametrize(
     ("k", "views", "length"),
-    [(1440, 1_000_000, 1440), (1440, 5000, 1440), (100, 32_000_000, 800), (1440, 48_900_000, 14_858), (7, 7, 7)],
+    [(1440, 1_000_000, 1440), (1440, 5000, 1440), (100, 16_000_000, 800), (1440, 48_900_000, 26628), (7, 7, 7)],
 )
 def test_a_larger_map_lists_more_views(k: int, views: int, length: int) -> None:
     assert longer_list(k, views) == length
