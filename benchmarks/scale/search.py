@@ -37,21 +37,27 @@ _CHUNK = 16_384
 _ROUNDS = 3
 
 
-@dataclass(frozen=True, slots=True)
-class Found:
-    """What a search in one map costs and finds.
+@dataclass(frozen=True, slots=True, eq=False)
+class Ready:
+    """A search in one map that is ready to be timed.
 
     Attributes:
-        ms: processor time of a search on one thread, ms: shortlist and exact comparison.
-        recall: share of the ten best views by exact search that are found, mean over all queries.
+        row: name that its rows begin with.
+        shortlister: makes the shortlist.
+        asked: queries.
+        views: number of views of the map.
     """
 
-    ms: float
-    recall: float
+    row: str
+    shortlister: Shortlister
+    asked: Asked
+    views: int
 
 
 def search_rows(report: Report, real: RealDescriptors, work: Path, sizes: tuple[int, ...] = SIZES) -> None:
     """Add the rows of every size, and the bars of a hundred towns.
+
+    All indices are built first. The times are measured one after the other at the end, so that they can be compared.
 
     Args:
         report: collects the rows and is written after each size.
@@ -63,78 +69,80 @@ def search_rows(report: Report, real: RealDescriptors, work: Path, sizes: tuple[
         for row_id, unit in BARRED.items():
             report.absent(row_id, unit, f"needs --sizes {TOWN} {TOWNS}")
     search_with_one_thread()
-    scanned: dict[int, Found] = {}
-    indexed: dict[int, Found] = {}
-    for views in sizes:
-        numbers = DrawnViews(real, views)
-        asked = numbers.queries(QUERIES)
-        tenth = tenth_best(numbers, asked)
-        kept = numbers[: min(views, KEPT)]
-        name = f"search.views_{views}"
-        if views <= MOST_SCANNED:
-            began = time.perf_counter()
-            copy = ScannedCopy.of(kept)
-            report.row(f"{name}.scan_open_s", time.perf_counter() - began, "s")
-            scanned[views] = _rows(report, f"{name}.scan", copy, numbers, asked, tenth, kept)
-        path = work / f"{views}.faiss"
-        began = time.perf_counter()
-        recall = write_inverted_file(path, numbers, headings=HEADINGS)
-        report.row(f"{name}.index_build_s", time.perf_counter() - began, "s", n=views)
-        report.row(
-            f"{name}.index_recall_at_build", recall, "share", why="what `build-map` prints: views with noise as queries"
-        )
-        report.row(f"{name}.index_bytes_per_view", path.stat().st_size / views, "B", n=views)
-        began = time.perf_counter()
-        opened = InvertedFile.open(path, views=views, dimension=numbers.shape[1], headings=HEADINGS)
-        report.row(f"{name}.index_open_s", time.perf_counter() - began, "s")
-        report.row(f"{name}.index_probes", opened.probes, "lists", n=opened.lists)
-        indexed[views] = _rows(report, f"{name}.index", opened, numbers, asked, tenth, kept)
-        if views == TOWNS:
-            _bars(report, scanned.get(TOWN), indexed.get(TOWN), indexed[views], path.stat().st_size / views)
-        del opened
-        path.unlink()
-        print(f"written: {report.write()}", flush=True)
+    ready: list[Ready] = []
+    paths = [work / f"{views}.faiss" for views in sizes]
+    try:
+        for views, path in zip(sizes, paths, strict=True):
+            ready += _built(report, DrawnViews(real, views), path)
+            print(f"written: {report.write()}", flush=True)
+        times = _time_rows(report, ready, DrawnViews(real, min(max(sizes), KEPT))[:])
+    finally:
+        for path in paths:
+            path.unlink(missing_ok=True)
+    if TOWNS in sizes:
+        _ratio_rows(report, times)
+    print(f"written: {report.write()}", flush=True)
 
 
-def _bars(report: Report, town: Found | None, town_indexed: Found | None, towns: Found, bytes_per_view: float) -> None:
-    """Add the rows that have a bar: a hundred towns against the town."""
-    report.row("search.recall_at_10_at_100_times_the_town", towns.recall, "share", bar=0.99, n=QUERIES)
-    report.row("search.bytes_per_view", bytes_per_view, "B", bar=40, better="lower", n=TOWNS)
-    if town is None or town_indexed is None:
-        why = f"needs the town too: --sizes {TOWN} {TOWNS}"
-        report.absent("search.ms_at_100_times_the_town", "ratio", why)
+def _built(report: Report, numbers: DrawnViews, path: Path) -> list[Ready]:
+    """Build the searches of one size, add all rows but their times, and return them."""
+    views, row, ready = len(numbers), f"search.views_{len(numbers)}", []
+    asked = numbers.queries(QUERIES)
+    tenth, listed = tenth_best(numbers, asked), min(SHORTLIST * WANTED, views)
+    if views <= MOST_SCANNED:
+        began = time.perf_counter()
+        copy = ScannedCopy.of(numbers[:])
+        report.row(f"{row}.scan_open_s", time.perf_counter() - began, "s")
+        recall = recall_at_10(copy, asked, tenth, numbers.__getitem__, listed)
+        report.row(f"{row}.scan_recall_at_10", recall, "share", n=QUERIES)
+        ready.append(Ready(f"{row}.scan", copy, asked, views))
+    began = time.perf_counter()
+    recall = write_inverted_file(path, numbers, headings=HEADINGS)
+    report.row(f"{row}.index_build_s", time.perf_counter() - began, "s", n=views)
+    why = "what `build-map` prints: views with noise as queries"
+    report.row(f"{row}.index_recall_at_build", recall, "share", why=why)
+    bytes_per_view = path.stat().st_size / views
+    report.row(f"{row}.index_bytes_per_view", bytes_per_view, "B", n=views)
+    began = time.perf_counter()
+    opened = InvertedFile.open(path, views=views, dimension=numbers.shape[1], headings=HEADINGS)
+    report.row(f"{row}.index_open_s", time.perf_counter() - began, "s")
+    report.row(f"{row}.index_probes", opened.probes, "lists", n=opened.lists)
+    recall = recall_at_10(opened, asked, tenth, numbers.__getitem__, listed)
+    report.row(f"{row}.index_recall_at_10", recall, "share", n=QUERIES)
+    if views == TOWNS:
+        report.row("search.recall_at_10_at_100_times_the_town", recall, "share", bar=0.99, n=QUERIES)
+        report.row("search.bytes_per_view", bytes_per_view, "B", bar=40, better="lower", n=TOWNS)
+    return [*ready, Ready(f"{row}.index", opened, asked, views)]
+
+
+def _time_rows(report: Report, ready: list[Ready], kept: Int8[NDArray[np.int8], "n D"]) -> dict[str, float]:
+    """Measure each search; add and return the times, ms. ``kept`` has the first views of the largest map, which all maps share."""
+    times = {}
+    for each in ready:
+        listed = min(SHORTLIST * WANTED, each.views)
+        times[each.row] = search_ms(each.shortlister, each.asked, kept[: each.views], listed)
+        report.row(f"{each.row}_ms", times[each.row], "ms", n=QUERIES)
+    return times
+
+
+def _ratio_rows(report: Report, times: dict[str, float]) -> None:
+    """Add the times of a hundred towns over those of the town."""
+    towns, town = times[f"search.views_{TOWNS}.index"], times.get(f"search.views_{TOWN}.scan")
+    indexed = times.get(f"search.views_{TOWN}.index")
+    if town is None or indexed is None:
+        report.absent("search.ms_at_100_times_the_town", "ratio", f"needs the town too: --sizes {TOWN} {TOWNS}")
         return
-    why = f"{towns.ms:.2f} ms against {town.ms:.2f} ms; the town is below the size of the index file, so it is scanned"
-    report.row(
-        "search.ms_at_100_times_the_town", towns.ms / town.ms, "ratio", bar=2, better="lower", n=QUERIES, why=why
-    )
-    why = f"{town_indexed.ms:.2f} ms for an index file of the town, which `build-map` does not write"
-    report.row(
-        "search.ms_at_100_times_the_indexed_town",
-        towns.ms / town_indexed.ms,
-        "ratio",
-        better="lower",
-        n=QUERIES,
-        why=why,
-    )
-
-
-def _rows(
-    report: Report,
-    name: str,
-    shortlister: Shortlister,
-    numbers: DrawnViews,
-    asked: Asked,
-    tenth: NDArray[np.float32],
-    kept: Int8[NDArray[np.int8], "n D"],
-) -> Found:
-    found = Found(
-        search_ms(shortlister, asked, kept, min(SHORTLIST * WANTED, len(numbers))),
-        recall_at_10(shortlister, asked, tenth, numbers.__getitem__, min(SHORTLIST * WANTED, len(numbers))),
-    )
-    report.row(f"{name}_ms", found.ms, "ms", n=len(asked.descriptors))
-    report.row(f"{name}_recall_at_10", found.recall, "share", n=len(asked.descriptors))
-    return found
+    for row_id, one, bar, why in (
+        ("search.ms_at_100_times_the_town", town, 2, "the town is below the size of the index file, so it is scanned"),
+        (
+            "search.ms_at_100_times_the_indexed_town",
+            indexed,
+            None,
+            "with an index file, which `build-map` does not write",
+        ),
+    ):
+        told = f"{towns:.2f} ms against {one:.2f} ms; {why}"
+        report.row(row_id, towns / one, "ratio", bar=bar, better="lower", n=QUERIES, why=told)
 
 
 def search_ms(shortlister: Shortlister, asked: Asked, kept: Int8[NDArray[np.int8], "n D"], listed: int) -> float:
