@@ -15,7 +15,6 @@ from benchmarks.report import ROOT, Report
 from benchmarks.runs import SIMULATION, Runs, code_hash
 from benchmarks.scale.built import built_rows, four_towns_row, timed_plan
 from benchmarks.scale.drawn import DrawnViews
-from benchmarks.scale.growth import growth_rows
 from benchmarks.scale.search import SIZES, search_rows
 from benchmarks.scale.served import served_rows
 from benchmarks.scale.sources import RealDescriptors, real_descriptors, small_city
@@ -27,7 +26,7 @@ from service.maps.index import vectors_of
 from service.retrieval.encoder import Encoder
 
 #: Parts of the report.
-PARTS = ("search", "growth", "served", "built", "memory", "store", "town")
+PARTS = ("search", "served", "built", "memory", "store", "town")
 #: Code that determines the real descriptors.
 _DESCRIBING = (*SIMULATION, "service/imaging", "benchmarks/scale/sources.py", "model_training/mapping/places.py")
 
@@ -67,7 +66,7 @@ def main() -> None:
         nargs="+",
         choices=PARTS,
         default=list(PARTS),
-        help="what to measure: search in drawn maps, recall for 1, 10 and 100 km of streets (growth), requests with a prior on a tiled map "
+        help="what to measure: search in drawn maps, requests with a prior on a tiled map "
         "(served), tiled builds that are killed, and both engines (built), the memory that a build of four small towns takes (memory), a "
         "map in object storage (store), a town of 20 km, which takes an hour (town)",
     )
@@ -88,9 +87,6 @@ def main() -> None:
         report.keep_others()
     if "search" in arguments.only:
         _search(report, arguments.work, tuple(sorted(arguments.sizes)))
-    if "growth" in arguments.only:
-        growth_rows(report, kept_descriptors(arguments.work))
-        report.write()
     if "served" in arguments.only:
         served_rows(report, Runs(arguments.work, ENCODER), arguments.work)
         report.write()

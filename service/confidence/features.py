@@ -29,6 +29,7 @@ _NEAREST = 5  # number of the most similar neighbours in ``pose_spread``
 _MOST_MARGIN = 12.0  # nats; largest margin, also used if there is no rival
 _MOST_PLACE_M = 10.0
 _LONE_ADVANTAGE = 0.3  # a typical value of right answers
+_LONE_SIMILARITY = 0.5  # similarity of the best neighbour elsewhere if there is none
 #: Difference in similarity that counts as much as one nat of the prior (decision 0183).
 _SIMILARITY_PER_NAT = ClusterSettings().temperature
 
@@ -75,12 +76,13 @@ class Evidence:
         xy = self.best.T_map_camera[:2, 3]
         return np.array([np.hypot(*(place.position_m[:2] - xy)) for place in self.neighbours])
 
-    def excluded_nats(
+    def prior_deficit_nats(
         self, xy: Float64[NDArray[np.float64], "n 2"], heading_rad: Float64[NDArray[np.float64], " n"]
     ) -> Float64[NDArray[np.float64], " n"]:
-        """Return how much less the query's prior allows each pose than the answer (n,), nats; 0 for a pose that it allows as much or more.
+        """Return how much lower the log weight of each pose by the prior is than that of the answer (n,), nats.
 
-        A place that the prior excludes is no rival of the answer (decision 0183). Without a prior the result is 0.
+        The result is 0 for a pose that the prior allows as much as the answer or more, and without a prior. A pose with a large
+        deficit is hardly a rival of the answer (decision 0183).
 
         Args:
             xy: positions, map frame, metres.
@@ -97,27 +99,35 @@ class Evidence:
     def inlier_advantage(self) -> float:
         """Inliers of the best candidate minus the median of its rivals; ``_LONE_ADVANTAGE`` without rivals.
 
-        A prior moves the inliers of an excluded rival to the value that stands for no rival.
+        With a prior, the median has the weights of the rivals by the prior. The lower the largest of these weights, the nearer the
+        result is to that without rivals.
         """
-        best, others = self.best.registered.inliers, distinct_candidates(self.refined.candidates)[1:]
+        others = distinct_candidates(self.refined.candidates)[1:]
         if not others:
             return _LONE_ADVANTAGE
-        xy = np.array([other.T_map_camera[:2, 3] for other in others])
-        allowed = np.exp(-self.excluded_nats(xy, np.array([heading_of_camera(other.T_map_camera) for other in others])))
         inliers = np.array([other.registered.inliers for other in others])
-        return best - float(np.median(allowed * inliers + (1 - allowed) * (best - _LONE_ADVANTAGE)))
+        best = self.best.registered.inliers
+        if self.frames[0].query.prior is None:
+            return best - float(np.median(inliers))
+        xy = np.array([other.T_map_camera[:2, 3] for other in others])
+        headings = np.array([heading_of_camera(other.T_map_camera) for other in others])
+        weights = np.exp(-self.prior_deficit_nats(xy, headings))
+        largest = float(weights.max())
+        return largest * (best - weighted_median(inliers, weights)) + (1.0 - largest) * _LONE_ADVANTAGE
 
     @property
     def similarity_margin(self) -> float:
         """Similarity of the best candidate minus that of the most similar neighbour elsewhere, times the root of the frames.
 
-        A prior lowers the similarity of an excluded neighbour.
+        With a prior, a neighbour's similarity is lower by ``_SIMILARITY_PER_NAT`` for each nat of its deficit, but not below
+        ``_LONE_SIMILARITY``.
         """
         xy = np.array([place.position_m[:2] for place in self.neighbours])
-        excluded = self.excluded_nats(xy, np.array([place.heading_rad for place in self.neighbours]))
-        similarity = np.array([place.similarity for place in self.neighbours]) - _SIMILARITY_PER_NAT * excluded
-        elsewhere = similarity[self.away_m > OTHER_PLACE_M]
-        other = float(elsewhere.max()) if len(elsewhere) else 0.5
+        deficit_nats = self.prior_deficit_nats(xy, np.array([place.heading_rad for place in self.neighbours]))
+        similarity = np.array([place.similarity for place in self.neighbours])
+        lowered = np.maximum(similarity - _SIMILARITY_PER_NAT * deficit_nats, np.minimum(similarity, _LONE_SIMILARITY))
+        elsewhere = lowered[self.away_m > OTHER_PLACE_M]
+        other = float(elsewhere.max()) if len(elsewhere) else _LONE_SIMILARITY
         return float(np.sqrt(len(self.frames))) * (self.best.scores["similarity"] - other)
 
     @property
@@ -132,12 +142,12 @@ class Evidence:
 
     @property
     def entropy(self) -> float:
-        """Entropy of the weights of the clusters, nats. A prior lowers the weight of an excluded cluster."""
+        """Entropy of the weights of the clusters, nats. With a prior, the weights are multiplied by those of the prior."""
         xy = np.array([hypothesis.position_m[:2] for hypothesis in self.hypotheses])
         weights = np.array([hypothesis.weight for hypothesis in self.hypotheses])
         if self.frames[0].query.prior is not None:
-            heading_rad = np.array([hypothesis.heading_rad for hypothesis in self.hypotheses])
-            weights = weights * np.exp(-self.excluded_nats(xy, heading_rad))
+            headings = np.array([hypothesis.heading_rad for hypothesis in self.hypotheses])
+            weights = weights * np.exp(-self.prior_deficit_nats(xy, headings))
             weights /= weights.sum()
         return float(-(weights * np.log(np.maximum(weights, 1e-12))).sum())
 
@@ -243,6 +253,20 @@ RIVALRY = tuple(feature.name for feature in TABLE if feature.rivalry)
 IDEALS: dict[str, int] = {feature.name: feature.sign for feature in TABLE if feature.ideal}
 #: Names of the features that the confidence does not use.
 UNWEIGHED = tuple(feature.name for feature in TABLE if not feature.weighted)
+
+
+def weighted_median(values: Float64[NDArray[np.float64], " n"], weights: Float64[NDArray[np.float64], " n"]) -> float:
+    """Return the median of values that have weights. Between two values it changes linearly with the weights.
+
+    Equal weights give the usual median.
+
+    Args:
+        values: one or more.
+        weights: of the values, above 0.
+    """
+    order = np.argsort(values)
+    share = np.cumsum(weights[order]) - 0.5 * weights[order]
+    return float(np.interp(0.5 * weights.sum(), share, values[order]))
 
 
 def evidence_of(

@@ -48,10 +48,10 @@ _QUERIES, _LISTED, _BEST = 128, 1_440, 10
 _NOISE = 0.6
 #: Recall to reach, and factor by which the number of lists that a search reads grows until then.
 _WANTED, _GROWTH = 0.992, 2**0.5
-#: Twice the lists that raise the recall by less than this are not worth their time: the shortlist is too short, or the graph misses lists.
+#: The build stops if twice as many lists raise the recall by less than this.
 _LEAST_GAIN = 0.002
-#: The shortlist of a map with more than ``SMALLEST`` views is longer by (views / ``SMALLEST``) to this power (decision 0158).
-_LENGTH_POWER = 0.75
+#: The shortlist of a map with more views than the first number is longer by (views / number) to this power (decision 0158).
+_LONGER_FROM, _LENGTH_POWER = 1_000_000, 0.75
 _QueryDescriptors = Float32[NDArray[np.float32], "q D"]
 #: FAISS without its type stubs, which lack many of the classes and fields that this file uses.
 _faiss: Any = faiss
@@ -90,10 +90,10 @@ def longer_list(k: int, views: int) -> int:
     In a larger map, more views are about as similar as the best ones, and their codes do not order them.
 
     Args:
-        k: length of the list in a map of ``SMALLEST`` views or fewer, at most the number of views.
+        k: length of the list in a map of ``_LONGER_FROM`` views or fewer, at most the number of views.
         views: number of views of the map.
     """
-    times = float(max(views / SMALLEST, 1.0) ** _LENGTH_POWER)
+    times = float(max(views / _LONGER_FROM, 1.0) ** _LENGTH_POWER)
     return min(round(k * times), views)
 
 
@@ -151,11 +151,11 @@ class InvertedFile:
         return int(self._lists.nprobe)
 
     def shortlist(self, descriptor: Float32[NDArray[np.float32], " D"], k: int) -> Int64[NDArray[np.int64], " n"]:
-        """Return the indices of about the k most similar views and of neighbours of the best third, ascending.
+        """Return the indices of about the k most similar views, and of neighbours of the first k / 3 of them, ascending.
 
         Args:
             descriptor: descriptor of the query view.
-            k: length of the list, at most the number of views. The list of a map beyond ``SMALLEST`` views is longer.
+            k: length of the list, at most the number of views. For a large map the list is longer (``longer_list``).
         """
         found = self._by_codes(descriptor, longer_list(k, self._lists.ntotal))
         return np.union1d(found, self._neighbours(found[: -(-k // _BRING)]))
@@ -251,7 +251,7 @@ def _choose_probes(whole: Any, numbers: Rows, headings: int) -> float:
     queries = _queries(numbers)
     tenth = _tenth_best(numbers, queries)
     inverted, opened = _faiss.downcast_index(whole.index), InvertedFile(whole, headings)
-    # Fewer lists do not hold the shortlist. A search then reads more of them, so their recall shows no plateau.
+    # With fewer lists than this, a search reads more of them anyway. Equal recall there does not mean that more lists find no more.
     enough = 2 * longer_list(min(_LISTED, len(numbers)), len(numbers)) * inverted.nlist / len(numbers)
     tried: list[tuple[int, float]] = []
     while True:

@@ -6,10 +6,9 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from benchmarks.scale import growth, search
+from benchmarks.scale import search
 from benchmarks.scale.built import APART_M, copied
 from benchmarks.scale.drawn import Asked, DrawnViews, _step
-from benchmarks.scale.growth import ranks_of_truth
 from benchmarks.scale.sources import HEADINGS, RealDescriptors
 from model_training.datasets.dataset import Dataset, scan_path
 from service.maps.index import vectors_of
@@ -116,36 +115,6 @@ def test_the_time_of_a_search_is_that_of_one_query(real: RealDescriptors) -> Non
     asked: Asked = drawn.queries(4)
     assert search.search_ms(SimpleNamespace(shortlist=shortlist), asked, drawn[:1000], 100) > 0
     assert calls == [100] * 3 * 4
-
-
-def test_the_rank_of_the_truth_counts_places_that_are_more_similar() -> None:
-    """The best right place lies 3 places from the true one. Three others are more similar, two of them within 50 places."""
-    views = np.zeros((200, HEADINGS, 2))
-    views[:, :, 1] = 1.0
-    for place, heading, similarity in (
-        (103, 7, 0.8),
-        (20, 0, 0.9),
-        (140, 5, 0.85),
-        (106, 23, 0.95),
-        (106, 3, 0.9),
-        (90, 0, 0.7),
-    ):
-        views[place, heading] = similarity, np.sqrt(1 - similarity**2)
-    numbers = np.rint(views.reshape(-1, 2) * 127).astype(np.int8)
-    # The second turn is no more similar to any view.
-    asked = Asked(np.array([[[1.0, 0.0], [-1.0, 0.0]]], np.float32), np.array([100 * HEADINGS]))
-    ranks, near_ranks = ranks_of_truth(numbers, asked)
-    assert (ranks.tolist(), near_ranks.tolist()) == ([3], [2])
-
-
-def test_the_rank_of_the_truth_is_the_same_for_chunks_of_any_size(
-    real: RealDescriptors, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    drawn = DrawnViews(real, 4800)
-    asked = drawn.queries(20)
-    whole = ranks_of_truth(drawn, asked)
-    monkeypatch.setattr(growth, "_PLACES_AT_ONCE", 7)
-    np.testing.assert_array_equal(ranks_of_truth(drawn, asked), whole)
 
 
 def test_copies_of_a_town_lie_apart_and_share_the_scans(small_dataset: Dataset, tmp_path: Path) -> None:

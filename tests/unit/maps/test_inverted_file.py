@@ -155,6 +155,17 @@ def test_a_shortlist_has_the_neighbours_of_its_best_third(opened: InvertedFile) 
     assert set(opened.shortlist(query, 30).tolist()) == expected
 
 
+def test_a_shortlist_of_a_large_map_is_longer_and_has_no_more_neighbours(
+    opened: InvertedFile, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """3,000 views are ten times 300: 10^0.75 = 5.62, so 169 views instead of 30. The first 10 bring their neighbours."""
+    monkeypatch.setattr(inverted_file, "_LONGER_FROM", 300)
+    query = unit_vectors(1, SIZE, seed=4)[0]
+    best = opened._by_codes(query, 169)
+    expected = set(best.tolist()) | set(opened._neighbours(best[:10]).tolist())
+    assert set(opened.shortlist(query, 30).tolist()) == expected
+
+
 def test_recall_counts_the_ten_best_views_that_are_listed(opened: InvertedFile, written: SimpleNamespace) -> None:
     """One query lists 7 of its 10 best views, the other all: 17 of 20."""
     stored = vectors_of(written.numbers)
