@@ -60,7 +60,7 @@ def search_rows(report: Report, real: RealDescriptors, work: Path, sizes: tuple[
     All indices are built first. The times are measured one after the other at the end, so that they can be compared.
 
     Args:
-        report: collects the rows and is written after each size.
+        report: collects the rows. It is written after each size and after each time.
         real: real descriptors.
         work: folder for index files, which are removed again.
         sizes: numbers of views, ascending.
@@ -75,7 +75,7 @@ def search_rows(report: Report, real: RealDescriptors, work: Path, sizes: tuple[
         for views, path in zip(sizes, paths, strict=True):
             ready += _built(report, DrawnViews(real, views), path)
             print(f"written: {report.write()}", flush=True)
-        times = _time_rows(report, ready, DrawnViews(real, min(max(sizes), KEPT))[:])
+        times = _time_rows(report, ready, _kept(DrawnViews(real, min(max(sizes), KEPT))))
     finally:
         for path in paths:
             path.unlink(missing_ok=True)
@@ -115,6 +115,14 @@ def _built(report: Report, numbers: DrawnViews, path: Path) -> list[Ready]:
     return [*ready, Ready(f"{row}.index", opened, asked, views)]
 
 
+def _kept(numbers: DrawnViews) -> Int8[NDArray[np.int8], "n D"]:
+    """Draw all views, some at a time, because drawing needs sixteen times the memory."""
+    kept = np.empty(numbers.shape, np.int8)
+    for first in range(0, len(numbers), _CHUNK):
+        kept[first : first + _CHUNK] = numbers[first : first + _CHUNK]
+    return kept
+
+
 def _time_rows(report: Report, ready: list[Ready], kept: Int8[NDArray[np.int8], "n D"]) -> dict[str, float]:
     """Measure each search; add and return the times, ms. ``kept`` has the first views of the largest map, which all maps share."""
     times = {}
@@ -122,6 +130,7 @@ def _time_rows(report: Report, ready: list[Ready], kept: Int8[NDArray[np.int8], 
         listed = min(SHORTLIST * WANTED, each.views)
         times[each.row] = search_ms(each.shortlister, each.asked, kept[: each.views], listed)
         report.row(f"{each.row}_ms", times[each.row], "ms", n=QUERIES)
+        report.write()
     return times
 
 

@@ -1,13 +1,15 @@
 """The index of a large map: an inverted file of short codes. It makes the shortlist without a scan of all views.
 
 FAISS groups the views by their nearest centroid, and a search reads only the groups near the query. A graph (HNSW) over the centroids
-finds these groups. The code of a view is its difference from the centroid, and takes four bits per axis. The neighbours of the best views
-along the survey complete the shortlist. Decision 0158 has the figures.
+finds these groups. The code of a view is its difference from the centroid, and takes four bits per axis. Views of neighbouring places look
+alike, so the index of a dense survey holds only every second place, and a search adds the places in between. Decisions 0158 and 0184 have
+the figures.
 """
 
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -26,20 +28,22 @@ SMALLEST = 1_000_000
 #: Parameter of the manifest: recall@10 of the index against exact search, as measured when it was built.
 RECALL = "search_recall_at_10"
 #: Number of principal axes. A map with fewer components has fewer.
-_AXES = 48
+_AXES = 128
+#: The index holds every second place if the views of one heading at neighbouring places are at least this similar, as median. They are up
+#: to 2.5 m apart (decision 0184).
+_ALIKE = 0.85
 #: Share of the views on either side that the range of a code leaves out. Rare values would make its steps too large.
 _OUTLIERS = 0.005
 #: Neighbours of a centroid in the graph.
 _LINKS = 32
 #: Fewest candidates of a search in the graph. More find nearer centroids and take longer.
 _LEAST_CANDIDATES = 64
-#: The first k / _BRING of a list for k views bring their neighbours into the exact search: the views of up to _PLACES places before and
-#: after in the survey, at up to _TURNS headings to each side.
-_BRING, _PLACES, _TURNS = 3, 2, 1
+#: The first k / _TURNED views of a list for k views also bring those of the next headings.
+_TURNED = 12
 #: Steps of k-means, and views for each centroid that it takes into account.
 _STEPS, _VIEWS_PER_LIST = 6, 16
-#: Smallest number of views that determine axes and ranges.
-_SAMPLE = 65_536
+#: Smallest number of views that determine axes and ranges, and largest number that are compared with their neighbours.
+_SAMPLE, _COMPARED = 65_536, 4_096
 #: Views that are read at once.
 _CHUNK = 16_384
 #: Queries that measure recall, views that each of them lists, and best views of these that count.
@@ -50,8 +54,6 @@ _NOISE = 0.6
 _WANTED, _GROWTH = 0.992, 2**0.5
 #: The build stops if twice as many lists raise the recall by less than this.
 _LEAST_GAIN = 0.002
-#: The shortlist of a map with more views than the first number is longer by (views / number) to this power (decision 0158).
-_LONGER_FROM, _LENGTH_POWER = 1_000_000, 0.75
 _QueryDescriptors = Float32[NDArray[np.float32], "q D"]
 #: FAISS without its type stubs, which lack many of the classes and fields that this file uses.
 _faiss: Any = faiss
@@ -68,9 +70,10 @@ def write_inverted_file(path: Path, numbers: Rows, *, headings: int) -> float:
         headings: number of views per place.
     """
     with _threads(1):
-        whole = _trained(numbers)
-        _add(whole, numbers)
-        recall = _choose_probes(whole, numbers, headings)
+        held = HeldViews(len(numbers), headings, _step_of(numbers, headings))
+        whole = _trained(numbers, held)
+        _add(whole, numbers, held)
+        recall = _choose_probes(whole, numbers, held)
         _faiss.write_index(whole, str(path))
     return recall
 
@@ -84,17 +87,50 @@ def lists_for(views: int) -> int:
     return int(2 ** max(0, round(np.log2(8 * np.sqrt(views)))))
 
 
-def longer_list(k: int, views: int) -> int:
-    """Return how many views a search lists by their codes.
+@dataclass(frozen=True, slots=True)
+class HeldViews:
+    """The views that an index holds: those of every ``step``-th place, numbered from 0.
 
-    In a larger map, more views are about as similar as the best ones, and their codes do not order them.
-
-    Args:
-        k: length of the list in a map of ``_LONGER_FROM`` views or fewer, at most the number of views.
+    Attributes:
         views: number of views of the map.
+        headings: number of views per place.
+        step: 1 or 2.
     """
-    times = float(max(views / _LONGER_FROM, 1.0) ** _LENGTH_POWER)
-    return min(round(k * times), views)
+
+    views: int
+    headings: int
+    step: int
+
+    def __len__(self) -> int:
+        """Return the number of views that the index holds."""
+        whole, rest = divmod(self.views, self.step * self.headings)
+        return whole * self.headings + min(rest, self.headings)
+
+    def in_map(self, held: Int64[NDArray[np.int64], " n"]) -> Int64[NDArray[np.int64], " n"]:
+        """Return the numbers of some of these views among all views of the map.
+
+        Args:
+            held: numbers in the index.
+        """
+        place, heading = np.divmod(held, self.headings)
+        return place * (self.step * self.headings) + heading
+
+    def around(
+        self, views: Int64[NDArray[np.int64], " n"], *, places: int, turns: int
+    ) -> Int64[NDArray[np.int64], " m"]:
+        """Return views of the map around some views, with these themselves.
+
+        Args:
+            views: numbers among all views of the map.
+            places: number of places before and after in the survey.
+            turns: number of headings to each side.
+        """
+        place, heading = np.divmod(views, self.headings)
+        turned = (heading[:, None] + np.arange(-turns, turns + 1)) % self.headings
+        along = place[:, None] + np.arange(-places, places + 1)
+        around = (along[:, :, None] * self.headings + turned[:, None, :]).ravel()
+        inside: NDArray[np.int64] = around[(around >= 0) & (around < self.views)]
+        return inside
 
 
 class InvertedFile:
@@ -102,11 +138,11 @@ class InvertedFile:
 
     Args:
         whole: principal axes and inverted file.
-        headings: number of views per place.
+        held: the views that it holds.
     """
 
-    def __init__(self, whole: Any, headings: int) -> None:
-        self._headings = headings
+    def __init__(self, whole: Any, held: HeldViews) -> None:
+        self._held = held
         self._whole = whole  # keeps the parts below alive
         self._axes = _faiss.downcast_VectorTransform(whole.chain.at(0))
         self._lists = _faiss.downcast_index(whole.index)
@@ -131,14 +167,16 @@ class InvertedFile:
         except RuntimeError as error:
             reason = str(error).splitlines()[0].rpartition("Error: ")[2]
             raise damaged_file(path, f"not a valid FAISS index ({reason})") from error
-        wrong = _unlike(whole, views, dimension, path.stat().st_size)
+        # The releases before decision 0184 held every place.
+        held = HeldViews(views, headings, 1 if whole.ntotal == views else 2)
+        wrong = _unlike(whole, held, dimension, path.stat().st_size)
         if not wrong and verify:
             wrong = _inconsistent(_faiss.downcast_index(whole.index))
         if wrong:
             raise damaged_file(path, wrong)
         # FAISS would start 32 threads for each search, which read the lists in advance (2 ms).
         _faiss.downcast_InvertedLists(_faiss.downcast_index(whole.index).invlists).prefetch_nthread = 0
-        return cls(whole, headings)
+        return cls(whole, held)
 
     @property
     def lists(self) -> int:
@@ -151,28 +189,32 @@ class InvertedFile:
         return int(self._lists.nprobe)
 
     def shortlist(self, descriptor: Float32[NDArray[np.float32], " D"], k: int) -> Int64[NDArray[np.int64], " n"]:
-        """Return the indices of about the k most similar views, and of neighbours of the first k / 3 of them, ascending.
-
-        Args:
-            descriptor: descriptor of the query view.
-            k: length of the list, at most the number of views. For a large map the list is longer (``longer_list``).
-        """
-        found = self._by_codes(descriptor, longer_list(k, self._lists.ntotal))
-        return np.union1d(found, self._neighbours(found[: -(-k // _BRING)]))
-
-    def most_similar(self, descriptor: Float32[NDArray[np.float32], " D"], k: int) -> Int64[NDArray[np.int64], " n"]:
-        """Return the indices of about the k most similar views, the most similar first.
-
-        The codes of the views decide, without an exact comparison.
+        """Return the indices of about the k most similar views and of views next to them, ascending.
 
         Args:
             descriptor: descriptor of the query view.
             k: length of the list, at most the number of views.
         """
-        return self._by_codes(descriptor, k)
+        found = self.most_similar(descriptor, -(-k // self._held.step))
+        beside = self._held.around(found, places=1, turns=0)
+        return np.union1d(beside, self._held.around(found[: -(-k // _TURNED)], places=1, turns=1))
+
+    def most_similar(self, descriptor: Float32[NDArray[np.float32], " D"], k: int) -> Int64[NDArray[np.int64], " n"]:
+        """Return the indices of about the k most similar views that the index holds, the most similar first.
+
+        The codes of the views decide, without an exact comparison.
+
+        Args:
+            descriptor: descriptor of the query view.
+            k: length of the list, at most the number of views. The index may hold fewer.
+        """
+        return self._held.in_map(self._by_codes(descriptor, min(k, len(self._held))))
 
     def _by_codes(self, descriptor: Float32[NDArray[np.float32], " D"], k: int) -> Int64[NDArray[np.int64], " n"]:
-        """Return the k most similar views by their codes, the best first. Fewer only if the graph does not lead to all lists."""
+        """Return the numbers in the index of the k most similar views by their codes, the best first.
+
+        There are fewer only if the graph does not lead to all lists.
+        """
         query, probes = self._axes.apply(descriptor[None]), self.probes
         while True:
             # The graph finds the nearest centroids only if it keeps as many candidates as it shall return.
@@ -183,15 +225,6 @@ class InvertedFile:
             if len(found) == k or probes >= self.lists:
                 return found
             probes *= 2  # these lists have fewer than k views
-
-    def _neighbours(self, views: Int64[NDArray[np.int64], " n"]) -> Int64[NDArray[np.int64], " m"]:
-        """Return views around some views: of places next to theirs in the survey, at headings next to theirs."""
-        place, heading = np.divmod(views, self._headings)
-        turned = (heading[:, None] + np.arange(-_TURNS, _TURNS + 1)) % self._headings
-        along = place[:, None] + np.arange(-_PLACES, _PLACES + 1)
-        around = (along[:, :, None] * self._headings + turned[:, None, :]).ravel()
-        inside: NDArray[np.int64] = around[(around >= 0) & (around < self._lists.ntotal)]
-        return inside
 
 
 @contextmanager
@@ -205,7 +238,17 @@ def _threads(count: int) -> Iterator[None]:
         _faiss.omp_set_num_threads(before)
 
 
-def _trained(numbers: Rows) -> Any:
+def _step_of(numbers: Rows, headings: int) -> int:
+    """Return 2 if neighbouring places look alike, else 1."""
+    count = len(numbers) - headings
+    if count < 1:
+        return 1
+    views = np.unique(np.linspace(0, count - 1, _COMPARED).astype(np.int64))
+    similarity = np.einsum("nd,nd->n", vectors_of(numbers[views]), vectors_of(numbers[views + headings]))
+    return 2 if float(np.median(similarity)) >= _ALIKE else 1
+
+
+def _trained(numbers: Rows, held: HeldViews) -> Any:
     """Return an index with axes, centroids and codes, but without views."""
     size, lists = numbers.shape[1], lists_for(len(numbers))
     name = f"PCA{min(_AXES, size)},IVF{lists}_HNSW{_LINKS},SQ4"
@@ -217,10 +260,10 @@ def _trained(numbers: Rows) -> Any:
     # The graph finds the nearest centroid of a view without a comparison with all centroids.
     graph = _faiss.IndexHNSWFlat(inverted.d, _LINKS, _faiss.METRIC_INNER_PRODUCT)
     inverted.clustering_index = graph
-    count = min(len(numbers), max(_SAMPLE, _VIEWS_PER_LIST * lists))
+    count = min(len(held), max(_SAMPLE, _VIEWS_PER_LIST * lists))
     # Drawn at random, because views at equal distances may all have one heading.
-    rows = np.random.default_rng(0).choice(len(numbers), count, replace=False)
-    sample = vectors_of(numbers[np.sort(rows)])
+    rows = np.random.default_rng(0).choice(len(held), count, replace=False)
+    sample = vectors_of(numbers[held.in_map(np.sort(rows))])
     # With their opposites the views have a mean of zero. So the axes keep the length of a view, and spherical centroids fit.
     some = sample[:: -(-len(sample) // _SAMPLE)]
     axes.train(np.concatenate([some, -some]))
@@ -230,29 +273,30 @@ def _trained(numbers: Rows) -> Any:
     return whole
 
 
-def _add(whole: Any, numbers: Rows) -> None:
-    """Add all views in their order. Lists and codes of a view do not depend on the number of threads."""
+def _add(whole: Any, numbers: Rows, held: HeldViews) -> None:
+    """Add the views in their order. Lists and codes of a view do not depend on the number of threads."""
     axes, inverted = _faiss.downcast_VectorTransform(whole.chain.at(0)), _faiss.downcast_index(whole.index)
-    for first in range(0, len(numbers), _CHUNK):
-        along = axes.apply(vectors_of(numbers[first : first + _CHUNK]))
+    for first in range(0, len(held), _CHUNK):
+        some = np.arange(first, min(first + _CHUNK, len(held)))
+        along = axes.apply(vectors_of(numbers[held.in_map(some)]))
         with _threads(os.cpu_count() or 1):
             inverted.add(along)
     whole.ntotal = inverted.ntotal
 
 
-def _choose_probes(whole: Any, numbers: Rows, headings: int) -> float:
+def _choose_probes(whole: Any, numbers: Rows, held: HeldViews) -> float:
     """Set about the smallest number of probes that reaches the recall wanted, or that more probes hardly improve; return the recall.
 
     Args:
-        whole: index of all views.
-        numbers: their descriptors.
-        headings: number of views per place.
+        whole: index.
+        numbers: descriptors of all views.
+        held: the views that the index holds.
     """
     queries = _queries(numbers)
     tenth = _tenth_best(numbers, queries)
-    inverted, opened = _faiss.downcast_index(whole.index), InvertedFile(whole, headings)
+    inverted, opened = _faiss.downcast_index(whole.index), InvertedFile(whole, held)
     # With fewer lists than this, a search reads more of them anyway. Equal recall there does not mean that more lists find no more.
-    enough = 2 * longer_list(min(_LISTED, len(numbers)), len(numbers)) * inverted.nlist / len(numbers)
+    enough = 2 * min(_LISTED, len(numbers)) * inverted.nlist / len(numbers)
     tried: list[tuple[int, float]] = []
     while True:
         inverted.nprobe = min(round(_GROWTH ** len(tried)), inverted.nlist)
@@ -308,7 +352,7 @@ def _tenth_best(numbers: Rows, queries: _QueryDescriptors) -> Float32[NDArray[np
     return tenth
 
 
-def _unlike(whole: Any, views: int, dimension: int, size: int) -> str:
+def _unlike(whole: Any, held: HeldViews, dimension: int, size: int) -> str:
     """Return how an index differs from that of a map; empty if it fits."""
     if not isinstance(whole, _faiss.IndexPreTransform) or whole.chain.size() != 1:
         return f"{type(whole).__name__} instead of principal axes with an inverted file"
@@ -318,8 +362,11 @@ def _unlike(whole: Any, views: int, dimension: int, size: int) -> str:
     graph, lists = _faiss.downcast_index(inverted.quantizer), _faiss.downcast_InvertedLists(inverted.invlists)
     if not isinstance(graph, _faiss.IndexHNSWFlat) or not isinstance(lists, _faiss.OnDiskInvertedLists):
         return f"{type(graph).__name__} and {type(lists).__name__} instead of IndexHNSWFlat and OnDiskInvertedLists"
-    if inverted.ntotal != views or lists.compute_ntotal() != views:
-        return f"{inverted.ntotal} views in its head and {lists.compute_ntotal()} in its lists instead of {views}"
+    if inverted.ntotal != len(held) or lists.compute_ntotal() != len(held):
+        return (
+            f"{inverted.ntotal} views in its head and {lists.compute_ntotal()} in its lists instead of {held.views}, or {len(held)} for "
+            "every second place"
+        )
     if whole.d != dimension or axes.d_out != inverted.d or graph.d != inverted.d:
         return f"descriptors of {whole.d} numbers instead of {dimension}, or parts that do not fit together"
     if graph.ntotal != inverted.nlist or not 1 <= inverted.nprobe <= inverted.nlist:

@@ -19,13 +19,14 @@ from service.errors import BundleError
 from service.maps import inverted_file
 from service.maps.content import BundleContent
 from service.maps.index import ScannedCopy, read_descriptors, vectors_of, write_descriptors
-from service.maps.inverted_file import FILE, RECALL, InvertedFile, lists_for, longer_list, write_inverted_file
+from service.maps.inverted_file import FILE, RECALL, HeldViews, InvertedFile, lists_for, write_inverted_file
 from service.maps.manifest import Manifest
 from service.maps.reader import MapBundle
 from service.maps.writer import sha256_of, write_bundle
 from service.retrieval.knn import search_views
 
 VIEWS, SIZE, PLACES, HEADINGS = 3000, 16, 100, 4
+HELD = VIEWS // 2
 
 
 def unit_vectors(count: int, size: int, seed: int = 0) -> np.ndarray:
@@ -33,11 +34,21 @@ def unit_vectors(count: int, size: int, seed: int = 0) -> np.ndarray:
     return vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
 
 
+def street_vectors(places: int, headings: int, size: int, *, alike: float = 0.9) -> np.ndarray:
+    """Unit vectors of views along a street, place by place. Those of neighbouring places have this similarity on average."""
+    noise = np.random.default_rng(0).normal(size=(places, headings, size)) / np.sqrt(size)
+    views = noise.copy()
+    for place in range(1, places):
+        views[place] = alike * views[place - 1] + np.sqrt(1 - alike**2) * noise[place]
+    vectors = views.reshape(-1, size).astype(np.float32)
+    return vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
+
+
 @pytest.fixture(scope="module")
 def written(tmp_path_factory: pytest.TempPathFactory) -> SimpleNamespace:
     """The descriptors of a map, its index file and the recall measured at its build."""
     folder = tmp_path_factory.mktemp("inverted")
-    write_descriptors(folder / "d.npy", unit_vectors(VIEWS, SIZE))
+    write_descriptors(folder / "d.npy", street_vectors(VIEWS // HEADINGS, HEADINGS, SIZE))
     numbers = read_descriptors(folder / "d.npy")
     recall = write_inverted_file(folder / FILE, numbers, headings=HEADINGS)
     return SimpleNamespace(path=folder / FILE, numbers=numbers, recall=recall)
@@ -71,19 +82,10 @@ def test_the_number_of_lists_follows_the_root_of_the_number_of_views(views: int,
     assert lists_for(views) == lists
 
 
-# 48.9^0.75 = 18.492, and 16^0.75 = 8.
-@pytest.mark.parametrize(
-    ("k", "views", "length"),
-    [(1440, 1_000_000, 1440), (1440, 5000, 1440), (100, 16_000_000, 800), (1440, 48_900_000, 26628), (7, 7, 7)],
-)
-def test_a_larger_map_lists_more_views(k: int, views: int, length: int) -> None:
-    assert longer_list(k, views) == length
-
-
 @pytest.mark.parametrize(
     ("recalls", "probes", "recall"),
     [
-        # probes 1, 1, 2, 3, 4, 6, 8, 11, 16, 23, 32, ...: 512 lists of about six views, so 20 listed views are in about 3.4 lists
+        # probes 1, 1, 2, 3, 4, 6, 8, 11, 16, 23, 32, ...: 512 lists for 3,000 views, so 20 listed views are in about 3.4 lists
         ([0.1, 0.1, 0.1, 0.1, 0.1, 0.5, 0.7, 0.9, 0.95, 0.993], 23, 0.993),
         ([0.1, 0.1, 0.1, 0.1, 0.1, 0.5, 0.7, 0.9, 0.95, 0.9505, 0.9515], 16, 0.95),  # 32 lists gain 0.0015 over 16
         ([0.1, 0.1, 0.1, 0.1, 0.1, 0.5, 0.7, 0.9, 0.95, 0.9505, 0.953, 0.9925], 45, 0.9925),  # 0.003
@@ -101,7 +103,7 @@ def test_the_build_stops_where_more_lists_find_no_more(
     given_recalls = iter(recalls)
     monkeypatch.setattr(inverted_file, "_LISTED", 20)
     monkeypatch.setattr(inverted_file, "recall_of", lambda *_: next(given_recalls))
-    assert inverted_file._choose_probes(whole, written.numbers, HEADINGS) == recall
+    assert inverted_file._choose_probes(whole, written.numbers, HeldViews(VIEWS, HEADINGS, 2)) == recall
     assert lists.nprobe == probes
 
 
@@ -110,7 +112,7 @@ def test_a_shortlist_holds_the_most_similar_views(written: SimpleNamespace, open
     stored, found = vectors_of(written.numbers), 0
     for query in unit_vectors(50, SIZE, seed=1):
         listed = opened.shortlist(query, 1440)
-        assert 1440 <= len(listed) == len(np.unique(listed))
+        assert 720 <= len(listed) == len(np.unique(listed))
         found += len(set(np.argsort(-(stored @ query))[:10].tolist()) & set(listed.tolist()))
     assert found >= 0.98 * 500
 
@@ -120,7 +122,8 @@ def test_a_shortlist_holds_the_most_similar_views(written: SimpleNamespace, open
 def test_a_shortlist_has_different_views_of_the_map(opened: InvertedFile, k: int, seed: int) -> None:
     """A list longer than the lists read first makes the search read more of them."""
     listed = opened.shortlist(unit_vectors(1, SIZE, seed=seed)[0], k)
-    assert k <= len(listed) <= k + 15 * -(-k // 3)
+    held = -(-k // 2)
+    assert held <= len(listed) <= 3 * held + 6 * -(-k // 12)
     assert (np.diff(listed) > 0).all()
     assert 0 <= listed.min() <= listed.max() < VIEWS
 
@@ -130,40 +133,48 @@ def test_a_longer_list_has_all_views_of_a_shorter_one(opened: InvertedFile) -> N
     assert set(opened.shortlist(query, 50).tolist()) <= set(opened.shortlist(query, 400).tolist())
 
 
-def test_the_neighbours_of_a_view_are_those_of_the_next_places_at_the_next_headings(opened: InvertedFile) -> None:
-    """View 21 has place 5 and heading 1 of 4. View 0 has place 0, so no places before it, and the heading before 0 is 3."""
-    expected = [4 * place + heading for place in (3, 4, 5, 6, 7) for heading in (0, 1, 2)]
-    assert opened._neighbours(np.array([21])).tolist() == expected
-    assert sorted(opened._neighbours(np.array([0])).tolist()) == [0, 1, 3, 4, 5, 7, 8, 9, 11]
-    assert sorted(opened._neighbours(np.array([VIEWS - 1])).tolist()) == [
-        2988,
-        2990,
-        2991,
-        2992,
-        2994,
-        2995,
-        2996,
-        2998,
-        2999,
-    ]
+@pytest.mark.parametrize(
+    ("views", "headings", "step", "held"),
+    [
+        (3000, 4, 2, 1500),
+        (3000, 4, 1, 3000),
+        (12, 4, 2, 8),  # places 0 and 2 of three
+        (4, 4, 2, 4),
+        (26, 4, 2, 14),  # places 0, 2 and 4, and half of place 6
+        (7, 1, 2, 4),
+    ],
+)
+def test_an_index_holds_the_views_of_every_second_place(views: int, headings: int, step: int, held: int) -> None:
+    which = HeldViews(views, headings, step)
+    numbers = which.in_map(np.arange(len(which)))
+    assert len(which) == held
+    assert numbers.tolist() == [view for view in range(views) if view // headings % step == 0]
 
 
-def test_a_shortlist_has_the_neighbours_of_its_best_third(opened: InvertedFile) -> None:
+def test_the_views_around_a_view_are_those_of_the_next_places_at_the_next_headings() -> None:
+    """View 21 has place 5 and heading 1 of 4. View 0 has place 0, so no place before it, and the heading before 0 is 3."""
+    which = HeldViews(VIEWS, HEADINGS, 2)
+    assert which.around(np.array([21]), places=1, turns=0).tolist() == [17, 21, 25]
+    assert which.around(np.array([21]), places=1, turns=1).tolist() == [16, 17, 18, 20, 21, 22, 24, 25, 26]
+    assert sorted(which.around(np.array([0]), places=1, turns=1).tolist()) == [0, 1, 3, 4, 5, 7]
+    assert sorted(which.around(np.array([VIEWS - 1]), places=1, turns=0).tolist()) == [VIEWS - 5, VIEWS - 1]
+
+
+def test_a_shortlist_has_the_places_between_and_the_turned_views_of_its_best(opened: InvertedFile) -> None:
+    """For 30 views the index lists 15. The first 3 also bring the next headings."""
     query = unit_vectors(1, SIZE, seed=4)[0]
-    best = opened._by_codes(query, 30)
-    expected = set(best.tolist()) | set(opened._neighbours(best[:10]).tolist())
+    best, which = opened.most_similar(query, 15), HeldViews(VIEWS, HEADINGS, 2)
+    assert (best // HEADINGS % 2 == 0).all()
+    expected = {*which.around(best, places=1, turns=0).tolist(), *which.around(best[:3], places=1, turns=1).tolist()}
     assert set(opened.shortlist(query, 30).tolist()) == expected
 
 
-def test_a_shortlist_of_a_large_map_is_longer_and_has_no_more_neighbours(
-    opened: InvertedFile, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """3,000 views are ten times 300: 10^0.75 = 5.62, so 169 views instead of 30. The first 10 bring their neighbours."""
-    monkeypatch.setattr(inverted_file, "_LONGER_FROM", 300)
-    query = unit_vectors(1, SIZE, seed=4)[0]
-    best = opened._by_codes(query, 169)
-    expected = set(best.tolist()) | set(opened._neighbours(best[:10]).tolist())
-    assert set(opened.shortlist(query, 30).tolist()) == expected
+@pytest.mark.parametrize(("alike", "held"), [(0.95, 400), (0.6, 800)])
+def test_a_survey_whose_places_differ_has_every_place_in_its_index(tmp_path: Path, alike: float, held: int) -> None:
+    write_descriptors(tmp_path / "d.npy", street_vectors(200, 4, SIZE, alike=alike))
+    write_inverted_file(tmp_path / FILE, read_descriptors(tmp_path / "d.npy"), headings=4)
+    opened = InvertedFile.open(tmp_path / FILE, views=800, dimension=SIZE, headings=4)
+    assert len(opened.most_similar(unit_vectors(1, SIZE)[0], 800)) == held
 
 
 def test_recall_counts_the_ten_best_views_that_are_listed(opened: InvertedFile, written: SimpleNamespace) -> None:
@@ -203,8 +214,8 @@ def test_a_view_takes_four_bits_per_axis_and_its_number(written: SimpleNamespace
     whole: Any = faiss.read_index(str(written.path))  # keeps its parts alive
     inverted: Any = faiss.downcast_index(whole.index)
     assert inverted.code_size == 8
-    assert inverted.invlists.compute_ntotal() == VIEWS
-    assert written.path.stat().st_size > 16 * VIEWS
+    assert inverted.invlists.compute_ntotal() == HELD
+    assert written.path.stat().st_size > 16 * HELD
 
 
 def test_an_odd_number_of_components_has_an_index_too(tmp_path: Path) -> None:
@@ -226,7 +237,11 @@ def test_a_truncated_file_is_refused(written: SimpleNamespace, tmp_path: Path, k
 @pytest.mark.parametrize(
     ("views", "dimension", "message"),
     [
-        (VIEWS - 1, SIZE, "3000 views in its head and 3000 in its lists instead of 2999"),
+        (
+            VIEWS - 8,
+            SIZE,
+            "1500 views in its head and 1500 in its lists instead of 2992, or 1496 for every second place",
+        ),
         (VIEWS, 8, "descriptors of 16 numbers instead of 8"),
     ],
 )
@@ -250,7 +265,7 @@ def test_another_kind_of_index_is_refused(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     ("number", "message"),
-    [(VIEWS, "refers to a missing view"), (-1, "refers to a missing view"), (None, "1 views are in no list")],
+    [(HELD, "refers to a missing view"), (-1, "refers to a missing view"), (None, "1 views are in no list")],
 )
 def test_lists_with_wrong_views_are_refused(
     written: SimpleNamespace, tmp_path: Path, number: int | None, message: str
