@@ -14,6 +14,7 @@ from benchmarks.scale.drawn import Asked, DrawnViews
 from benchmarks.scale.sources import HEADINGS, RealDescriptors
 from service.maps.index import ScannedCopy, Shortlister, search_with_one_thread, vectors_of
 from service.maps.inverted_file import InvertedFile, write_inverted_file
+from service.maps.tiles import LISTED, MOST_SEARCHED, in_order
 from service.retrieval.knn import SHORTLIST
 
 #: Views of the town of 1 x 1 km and 20 km of streets, and of a hundred such towns.
@@ -28,6 +29,8 @@ BARRED = {
 }
 #: Queries, and views that an answer takes from a search by default.
 QUERIES, WANTED = 100, 240
+#: Places of a tile, and its views.
+TILE_PLACES, TILE_VIEWS = 500, 500 * HEADINGS
 #: Best views that count for recall.
 BEST = 10
 #: Descriptors in memory that the exact comparison reads. The 12.5 GB of a hundred towns do not fit, so theirs are read at other places.
@@ -109,10 +112,26 @@ def _built(report: Report, numbers: DrawnViews, path: Path) -> list[Ready]:
     report.row(f"{row}.index_probes", opened.probes, "lists", n=opened.lists)
     recall = recall_at_10(opened, asked, tenth, numbers.__getitem__, listed)
     report.row(f"{row}.index_recall_at_10", recall, "share", n=QUERIES)
+    report.share(f"{row}.index_finds_tile", finds_tile(opened, asked, views))
     if views == TOWNS:
         report.row("search.recall_at_10_at_100_times_the_town", recall, "share", bar=0.99, n=QUERIES)
         report.row("search.bytes_per_view", bytes_per_view, "B", bar=40, better="lower", n=TOWNS)
     return [*ready, Ready(f"{row}.index", opened, asked, views)]
+
+
+def finds_tile(opened: InvertedFile, asked: Asked, views: int) -> NDArray[np.bool_]:
+    """Return for each query whether its tile is among those that a tiled map searches without a prior. The codes alone decide.
+
+    Args:
+        opened: the index.
+        asked: queries.
+        views: number of views of the map.
+    """
+    found = np.zeros(len(asked.descriptors), np.bool_)
+    for number, (turns, true) in enumerate(zip(asked.descriptors, asked.true_view, strict=True)):
+        similar = opened.most_similar(turns.mean(axis=0), min(LISTED, views))
+        found[number] = true // TILE_VIEWS in in_order(similar // TILE_VIEWS)[:MOST_SEARCHED]
+    return found
 
 
 def _kept(numbers: DrawnViews) -> Int8[NDArray[np.int8], "n D"]:

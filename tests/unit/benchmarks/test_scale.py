@@ -117,6 +117,15 @@ def test_the_time_of_a_search_is_that_of_one_query(real: RealDescriptors) -> Non
     assert calls == [100] * 3 * 4
 
 
+def test_a_tile_is_found_if_it_is_among_the_first_six_of_the_list(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Tiles of ten views. The first query has tile 7 as the sixth tile of its list, the second as the seventh."""
+    monkeypatch.setattr(search, "TILE_VIEWS", 10)
+    lists = iter([np.array([0, 1, 10, 20, 30, 31, 40, 75]), np.array([0, 10, 20, 30, 40, 50, 75])])
+    fake = SimpleNamespace(most_similar=lambda _descriptor, _k: next(lists))
+    asked = Asked(np.ones((2, 3, SIZE), np.float32), np.array([71, 71]))
+    assert search.finds_tile(fake, asked, 100).tolist() == [True, False]
+
+
 def test_copies_of_a_town_lie_apart_and_share_the_scans(small_dataset: Dataset, tmp_path: Path) -> None:
     town, poses = small_dataset, small_dataset.survey_poses()
     both = copied(town, tmp_path / "both", 2)
