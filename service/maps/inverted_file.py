@@ -38,8 +38,9 @@ _OUTLIERS = 0.005
 _LINKS = 32
 #: Fewest candidates of a search in the graph. More find nearer centroids and take longer.
 _LEAST_CANDIDATES = 64
-#: The first k / _TURNED views of a list for k views also bring those of the next headings.
-_TURNED = 12
+#: All listed views bring those of the places beside them. The first k / _BEST_PART of a list for k views bring the views of _PLACES places
+#: to each side, also at the next headings.
+_BEST_PART, _PLACES = 12, 3
 #: Steps of k-means, and views for each centroid that it takes into account.
 _STEPS, _VIEWS_PER_LIST = 6, 16
 #: Smallest number of views that determine axes and ranges, and largest number that are compared with their neighbours.
@@ -167,7 +168,6 @@ class InvertedFile:
         except RuntimeError as error:
             reason = str(error).splitlines()[0].rpartition("Error: ")[2]
             raise damaged_file(path, f"not a valid FAISS index ({reason})") from error
-        # The releases before decision 0184 held every place.
         held = HeldViews(views, headings, 1 if whole.ntotal == views else 2)
         wrong = _unlike(whole, held, dimension, path.stat().st_size)
         if not wrong and verify:
@@ -197,7 +197,7 @@ class InvertedFile:
         """
         found = self.most_similar(descriptor, -(-k // self._held.step))
         beside = self._held.around(found, places=1, turns=0)
-        return np.union1d(beside, self._held.around(found[: -(-k // _TURNED)], places=1, turns=1))
+        return np.union1d(beside, self._held.around(found[: -(-k // _BEST_PART)], places=_PLACES, turns=1))
 
     def most_similar(self, descriptor: Float32[NDArray[np.float32], " D"], k: int) -> Int64[NDArray[np.int64], " n"]:
         """Return the indices of about the k most similar views that the index holds, the most similar first.
