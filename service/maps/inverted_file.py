@@ -2,14 +2,13 @@
 
 FAISS groups the views by their nearest centroid, and a search reads only the groups near the query. A graph (HNSW) over the centroids
 finds these groups. The code of a view is its difference from the centroid, and takes four bits per axis. Views of neighbouring places look
-alike, so the index of a dense survey holds only every second place, and a search adds the places in between. Decisions 0158 and 0184 have
+alike, so the index of a dense survey holds about every second place, and a search adds the places in between. Decisions 0158 and 0184 have
 the figures.
 """
 
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -29,8 +28,8 @@ SMALLEST = 1_000_000
 RECALL = "search_recall_at_10"
 #: Number of principal axes. A map with fewer components has fewer.
 _AXES = 128
-#: The index holds every second place if the views of one heading at neighbouring places are at least this similar, as median. They are up
-#: to 2.5 m apart (decision 0184).
+#: The index omits a place with an odd number if its views are at least this similar to those of the place before or after it, as median
+#: over the headings. Such places are up to 2.5 m apart (decision 0184).
 _ALIKE = 0.85
 #: Share of the views on either side that the range of a code leaves out. Rare values would make its steps too large.
 _OUTLIERS = 0.005
@@ -43,8 +42,8 @@ _LEAST_CANDIDATES = 64
 _BEST_PART, _PLACES = 12, 3
 #: Steps of k-means, and views for each centroid that it takes into account.
 _STEPS, _VIEWS_PER_LIST = 6, 16
-#: Smallest number of views that determine axes and ranges, and largest number that are compared with their neighbours.
-_SAMPLE, _COMPARED = 65_536, 4_096
+#: Smallest number of views that determine axes and ranges.
+_SAMPLE = 65_536
 #: Views that are read at once.
 _CHUNK = 16_384
 #: Queries that measure recall, views that each of them lists, and best views of these that count.
@@ -67,14 +66,14 @@ def write_inverted_file(path: Path, numbers: Rows, *, headings: int) -> float:
 
     Args:
         path: the new file.
-        numbers: 8-bit descriptors, a row per view, as ``write_descriptors`` stores them. Places follow each other as in the survey.
+        numbers: 8-bit descriptors, a row per view, as ``write_descriptors`` stores them. Most places follow each other as in the survey.
         headings: number of views per place.
     """
     with _threads(1):
-        held = HeldViews(len(numbers), headings, _step_of(numbers, headings))
+        held = views_to_hold(numbers, headings)
         whole = _trained(numbers, held)
         _add(whole, numbers, held)
-        recall = _choose_probes(whole, numbers, held)
+        recall = _choose_probes(whole, numbers, headings)
         _faiss.write_index(whole, str(path))
     return recall
 
@@ -88,50 +87,28 @@ def lists_for(views: int) -> int:
     return int(2 ** max(0, round(np.log2(8 * np.sqrt(views)))))
 
 
-@dataclass(frozen=True, slots=True)
-class HeldViews:
-    """The views that an index holds: those of every ``step``-th place, numbered from 0.
+def views_to_hold(numbers: Rows, headings: int) -> Int64[NDArray[np.int64], " n"]:
+    """Return the views that an index holds, ascending: those of all places with an even number, and of odd ones that look different.
 
-    Attributes:
-        views: number of views of the map.
+    A place with an odd number is omitted if a place beside it looks alike, because a search adds the places beside those that it finds.
+    Places that were appended to a map may look like neither.
+
+    Args:
+        numbers: 8-bit descriptors of all views.
         headings: number of views per place.
-        step: 1 or 2.
     """
-
-    views: int
-    headings: int
-    step: int
-
-    def __len__(self) -> int:
-        """Return the number of views that the index holds."""
-        whole, rest = divmod(self.views, self.step * self.headings)
-        return whole * self.headings + min(rest, self.headings)
-
-    def in_map(self, held: Int64[NDArray[np.int64], " n"]) -> Int64[NDArray[np.int64], " n"]:
-        """Return the numbers of some of these views among all views of the map.
-
-        Args:
-            held: numbers in the index.
-        """
-        place, heading = np.divmod(held, self.headings)
-        return place * (self.step * self.headings) + heading
-
-    def around(
-        self, views: Int64[NDArray[np.int64], " n"], *, places: int, turns: int
-    ) -> Int64[NDArray[np.int64], " m"]:
-        """Return views of the map around some views, with these themselves.
-
-        Args:
-            views: numbers among all views of the map.
-            places: number of places before and after in the survey.
-            turns: number of headings to each side.
-        """
-        place, heading = np.divmod(views, self.headings)
-        turned = (heading[:, None] + np.arange(-turns, turns + 1)) % self.headings
-        along = place[:, None] + np.arange(-places, places + 1)
-        around = (along[:, :, None] * self.headings + turned[:, None, :]).ravel()
-        inside: NDArray[np.int64] = around[(around >= 0) & (around < self.views)]
-        return inside
+    places = -(-len(numbers) // headings)
+    # similarity of each place to the one before; that of the first place, and of a last place with fewer views, stays -1
+    before = np.full(places + 1, -1.0)
+    step = max(_CHUNK // headings, 1)
+    for first in range(0, len(numbers) // headings - 1, step):
+        last = min(first + step + 1, len(numbers) // headings)
+        views = vectors_of(numbers[first * headings : last * headings]).reshape(last - first, headings, -1)
+        before[first + 1 : last] = np.median(np.einsum("phd,phd->ph", views[1:], views[:-1]), axis=1)
+    is_held = np.maximum(before[:-1], before[1:]) < _ALIKE
+    is_held[::2] = True
+    held = (np.flatnonzero(is_held)[:, None] * headings + np.arange(headings)).ravel()
+    return held[held < len(numbers)]
 
 
 class InvertedFile:
@@ -139,11 +116,12 @@ class InvertedFile:
 
     Args:
         whole: principal axes and inverted file.
-        held: the views that it holds.
+        views: number of views of the map.
+        headings: number of views per place.
     """
 
-    def __init__(self, whole: Any, held: HeldViews) -> None:
-        self._held = held
+    def __init__(self, whole: Any, views: int, headings: int) -> None:
+        self._views, self._headings = views, headings
         self._whole = whole  # keeps the parts below alive
         self._axes = _faiss.downcast_VectorTransform(whole.chain.at(0))
         self._lists = _faiss.downcast_index(whole.index)
@@ -157,7 +135,8 @@ class InvertedFile:
             views: number of views of the map.
             dimension: number of components of a descriptor.
             headings: number of views per place.
-            verify: check that the lists hold every view once, and that the graph refers to its own centroids.
+            verify: check that the lists hold no view twice and all places with an even number, and that the graph refers to its own
+                centroids.
 
         Raises:
             BundleError: the file is damaged, or belongs to another map.
@@ -168,15 +147,14 @@ class InvertedFile:
         except RuntimeError as error:
             reason = str(error).splitlines()[0].rpartition("Error: ")[2]
             raise damaged_file(path, f"not a valid FAISS index ({reason})") from error
-        held = HeldViews(views, headings, 1 if whole.ntotal == views else 2)
-        wrong = _unlike(whole, held, dimension, path.stat().st_size)
+        wrong = _unlike(whole, views, dimension, path.stat().st_size)
         if not wrong and verify:
-            wrong = _inconsistent(_faiss.downcast_index(whole.index))
+            wrong = _inconsistent(_faiss.downcast_index(whole.index), views, headings)
         if wrong:
             raise damaged_file(path, wrong)
         # FAISS would start 32 threads for each search, which read the lists in advance (2 ms).
         _faiss.downcast_InvertedLists(_faiss.downcast_index(whole.index).invlists).prefetch_nthread = 0
-        return cls(whole, held)
+        return cls(whole, views, headings)
 
     @property
     def lists(self) -> int:
@@ -195,9 +173,9 @@ class InvertedFile:
             descriptor: descriptor of the query view.
             k: length of the list, at most the number of views.
         """
-        found = self.most_similar(descriptor, -(-k // self._held.step))
-        beside = self._held.around(found, places=1, turns=0)
-        return np.union1d(beside, self._held.around(found[: -(-k // _BEST_PART)], places=_PLACES, turns=1))
+        found = self._by_codes(descriptor, -(-k * self._lists.ntotal // self._views))
+        beside = self._around(found, places=1, turns=0)
+        return np.union1d(beside, self._around(found[: -(-k // _BEST_PART)], places=_PLACES, turns=1))
 
     def most_similar(self, descriptor: Float32[NDArray[np.float32], " D"], k: int) -> Int64[NDArray[np.int64], " n"]:
         """Return the indices of about the k most similar views that the index holds, the most similar first.
@@ -208,10 +186,10 @@ class InvertedFile:
             descriptor: descriptor of the query view.
             k: length of the list, at most the number of views. The index may hold fewer.
         """
-        return self._held.in_map(self._by_codes(descriptor, min(k, len(self._held))))
+        return self._by_codes(descriptor, min(k, self._lists.ntotal))
 
     def _by_codes(self, descriptor: Float32[NDArray[np.float32], " D"], k: int) -> Int64[NDArray[np.int64], " n"]:
-        """Return the numbers in the index of the k most similar views by their codes, the best first.
+        """Return the k most similar views by their codes, the best first.
 
         There are fewer only if the graph does not lead to all lists.
         """
@@ -226,6 +204,17 @@ class InvertedFile:
                 return found
             probes *= 2  # these lists have fewer than k views
 
+    def _around(
+        self, views: Int64[NDArray[np.int64], " n"], *, places: int, turns: int
+    ) -> Int64[NDArray[np.int64], " m"]:
+        """Return some views and those around them: of places next to theirs by number, at headings next to theirs."""
+        place, heading = np.divmod(views, self._headings)
+        turned = (heading[:, None] + np.arange(-turns, turns + 1)) % self._headings
+        along = place[:, None] + np.arange(-places, places + 1)
+        around = (along[:, :, None] * self._headings + turned[:, None, :]).ravel()
+        inside: NDArray[np.int64] = around[(around >= 0) & (around < self._views)]
+        return inside
+
 
 @contextmanager
 def _threads(count: int) -> Iterator[None]:
@@ -238,20 +227,11 @@ def _threads(count: int) -> Iterator[None]:
         _faiss.omp_set_num_threads(before)
 
 
-def _step_of(numbers: Rows, headings: int) -> int:
-    """Return 2 if neighbouring places look alike, else 1."""
-    count = len(numbers) - headings
-    if count < 1:
-        return 1
-    views = np.unique(np.linspace(0, count - 1, _COMPARED).astype(np.int64))
-    similarity = np.einsum("nd,nd->n", vectors_of(numbers[views]), vectors_of(numbers[views + headings]))
-    return 2 if float(np.median(similarity)) >= _ALIKE else 1
-
-
-def _trained(numbers: Rows, held: HeldViews) -> Any:
+def _trained(numbers: Rows, held: Int64[NDArray[np.int64], " n"]) -> Any:
     """Return an index with axes, centroids and codes, but without views."""
-    size, lists = numbers.shape[1], lists_for(len(numbers))
-    name = f"PCA{min(_AXES, size)},IVF{lists}_HNSW{_LINKS},SQ4"
+    # Each list needs a view as its centroid.
+    size, lists = numbers.shape[1], min(lists_for(len(numbers)), 2 ** int(np.log2(len(held))))
+    name = f"PCA{min(_AXES, size, len(held))},IVF{lists}_HNSW{_LINKS},SQ4"
     whole = _faiss.index_factory(size, name, _faiss.METRIC_INNER_PRODUCT)
     axes, inverted = _faiss.downcast_VectorTransform(whole.chain.at(0)), _faiss.downcast_index(whole.index)
     settings = inverted.cp
@@ -263,7 +243,7 @@ def _trained(numbers: Rows, held: HeldViews) -> Any:
     count = min(len(held), max(_SAMPLE, _VIEWS_PER_LIST * lists))
     # Drawn at random, because views at equal distances may all have one heading.
     rows = np.random.default_rng(0).choice(len(held), count, replace=False)
-    sample = vectors_of(numbers[held.in_map(np.sort(rows))])
+    sample = vectors_of(numbers[held[np.sort(rows)]])
     # With their opposites the views have a mean of zero. So the axes keep the length of a view, and spherical centroids fit.
     some = sample[:: -(-len(sample) // _SAMPLE)]
     axes.train(np.concatenate([some, -some]))
@@ -273,39 +253,39 @@ def _trained(numbers: Rows, held: HeldViews) -> Any:
     return whole
 
 
-def _add(whole: Any, numbers: Rows, held: HeldViews) -> None:
-    """Add the views in their order. Lists and codes of a view do not depend on the number of threads."""
+def _add(whole: Any, numbers: Rows, held: Int64[NDArray[np.int64], " n"]) -> None:
+    """Add some views in their order, with their numbers. Lists and codes of a view do not depend on the number of threads."""
     axes, inverted = _faiss.downcast_VectorTransform(whole.chain.at(0)), _faiss.downcast_index(whole.index)
     for first in range(0, len(held), _CHUNK):
-        some = np.arange(first, min(first + _CHUNK, len(held)))
-        along = axes.apply(vectors_of(numbers[held.in_map(some)]))
+        some = held[first : first + _CHUNK]
+        along = axes.apply(vectors_of(numbers[some]))
         with _threads(os.cpu_count() or 1):
-            inverted.add(along)
+            inverted.add_with_ids(along, some)
     whole.ntotal = inverted.ntotal
 
 
-def _choose_probes(whole: Any, numbers: Rows, held: HeldViews) -> float:
+def _choose_probes(whole: Any, numbers: Rows, headings: int) -> float:
     """Set about the smallest number of probes that reaches the recall wanted, or that more probes hardly improve; return the recall.
 
     Args:
         whole: index.
         numbers: descriptors of all views.
-        held: the views that the index holds.
+        headings: number of views per place.
     """
     queries = _queries(numbers)
     tenth = _tenth_best(numbers, queries)
-    inverted, opened = _faiss.downcast_index(whole.index), InvertedFile(whole, held)
-    # With fewer lists than this, a search reads more of them anyway. Equal recall there does not mean that more lists find no more.
-    enough = 2 * min(_LISTED, len(numbers)) * inverted.nlist / len(numbers)
+    inverted, opened = _faiss.downcast_index(whole.index), InvertedFile(whole, len(numbers), headings)
+    # The lists that hold about the shortlist. With fewer, a search reads more of them anyway.
+    fewest = min(_LISTED, len(numbers)) * inverted.nlist / len(numbers)
     tried: list[tuple[int, float]] = []
     while True:
-        inverted.nprobe = min(round(_GROWTH ** len(tried)), inverted.nlist)
+        inverted.nprobe = min(round(max(fewest, 1.0) * _GROWTH ** len(tried)), inverted.nlist)
         recall = recall_of(opened, numbers, queries, tenth)
         tried.append((inverted.nprobe, recall))
         if recall >= _WANTED or inverted.nprobe == inverted.nlist:
             return recall
         half_probes, half_recall = tried[max(len(tried) - 3, 0)]
-        if half_probes >= enough and recall - half_recall < _LEAST_GAIN:
+        if len(tried) > 2 and recall - half_recall < _LEAST_GAIN:
             inverted.nprobe = half_probes
             return half_recall
 
@@ -352,7 +332,7 @@ def _tenth_best(numbers: Rows, queries: _QueryDescriptors) -> Float32[NDArray[np
     return tenth
 
 
-def _unlike(whole: Any, held: HeldViews, dimension: int, size: int) -> str:
+def _unlike(whole: Any, views: int, dimension: int, size: int) -> str:
     """Return how an index differs from that of a map; empty if it fits."""
     if not isinstance(whole, _faiss.IndexPreTransform) or whole.chain.size() != 1:
         return f"{type(whole).__name__} instead of principal axes with an inverted file"
@@ -362,11 +342,8 @@ def _unlike(whole: Any, held: HeldViews, dimension: int, size: int) -> str:
     graph, lists = _faiss.downcast_index(inverted.quantizer), _faiss.downcast_InvertedLists(inverted.invlists)
     if not isinstance(graph, _faiss.IndexHNSWFlat) or not isinstance(lists, _faiss.OnDiskInvertedLists):
         return f"{type(graph).__name__} and {type(lists).__name__} instead of IndexHNSWFlat and OnDiskInvertedLists"
-    if inverted.ntotal != len(held) or lists.compute_ntotal() != len(held):
-        return (
-            f"{inverted.ntotal} views in its head and {lists.compute_ntotal()} in its lists instead of {held.views}, or {len(held)} for "
-            "every second place"
-        )
+    if inverted.ntotal != lists.compute_ntotal() or not views <= 2 * inverted.ntotal <= 2 * views:
+        return f"{inverted.ntotal} views in its head and {lists.compute_ntotal()} in its lists for a map of {views}"
     if whole.d != dimension or axes.d_out != inverted.d or graph.d != inverted.d:
         return f"descriptors of {whole.d} numbers instead of {dimension}, or parts that do not fit together"
     if graph.ntotal != inverted.nlist or not 1 <= inverted.nprobe <= inverted.nlist:
@@ -381,19 +358,21 @@ def _unlike(whole: Any, held: HeldViews, dimension: int, size: int) -> str:
     return ""
 
 
-def _inconsistent(inverted: Any) -> str:
-    """Return which reference of an index leads nowhere; empty if there is none."""
-    lists, seen = _faiss.downcast_InvertedLists(inverted.invlists), np.zeros(inverted.ntotal, np.bool_)
+def _inconsistent(inverted: Any, views: int, headings: int) -> str:
+    """Return which reference of an index leads nowhere or which view is missing; empty if there is none."""
+    lists, seen = _faiss.downcast_InvertedLists(inverted.invlists), np.zeros(views, np.bool_)
     for number in range(inverted.nlist):
         count = lists.list_size(number)
         if not count:
             continue
-        views: NDArray[np.int64] = _faiss.rev_swig_ptr(lists.get_ids(number), count)
-        if views.min() < 0 or views.max() >= len(seen):
+        held: NDArray[np.int64] = _faiss.rev_swig_ptr(lists.get_ids(number), count)
+        if held.min() < 0 or held.max() >= views:
             return f"list {number} refers to a missing view"
-        seen[views] = True
-    if not seen.all():
-        return f"{int((~seen).sum())} views are in no list"
+        seen[held] = True
+    if (found := int(seen.sum())) != inverted.ntotal:
+        return f"{inverted.ntotal - found} views are in two lists"
+    if missing := int((~seen & (np.arange(views) // headings % 2 == 0)).sum()):
+        return f"{missing} views of every second place are in no list"
     graph = _faiss.downcast_index(inverted.quantizer).hnsw
     neighbours = _faiss.vector_to_array(graph.neighbors)
     if len(neighbours) and not -1 <= neighbours.min() <= neighbours.max() < inverted.nlist:
