@@ -6,6 +6,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from benchmarks.report import Report
 from benchmarks.scale import search
 from benchmarks.scale.built import APART_M, copied
 from benchmarks.scale.drawn import Asked, DrawnViews, _step
@@ -124,6 +125,28 @@ def test_a_tile_is_found_if_it_is_among_the_first_six_of_the_list(monkeypatch: p
     fake = SimpleNamespace(most_similar=lambda _descriptor, _k: next(lists))
     asked = Asked(np.ones((2, 3, SIZE), np.float32), np.array([71, 71]))
     assert search.finds_tile(fake, asked, 100).tolist() == [True, False]
+
+
+def test_all_sizes_are_built_and_then_timed(
+    real: RealDescriptors, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A town of 2,880 views is scanned and has an index. Four towns have only an index."""
+    monkeypatch.setattr(search, "TOWN", 2880)
+    monkeypatch.setattr(search, "TOWNS", 11_520)
+    monkeypatch.setattr(search, "MOST_SCANNED", 2880)
+    monkeypatch.setattr(search, "KEPT", 5000)
+    report = Report("scale", "make bench-scale")
+    monkeypatch.setattr(report, "write", lambda: None)
+    search.search_rows(report, real, tmp_path, (2880, 11_520))
+    found = {row["id"]: row["value"] for row in report.rows}
+    assert not list(tmp_path.iterdir())
+    assert found["search.views_2880.scan_recall_at_10"] > 0.9
+    assert found["search.views_11520.index_recall_at_10"] == found["search.recall_at_10_at_100_times_the_town"] > 0.9
+    assert found["search.views_11520.index_finds_tile"] == 1.0  # there are fewer than six tiles
+    assert "search.views_11520.scan_ms" not in found
+    towns = found["search.views_11520.index_ms"]
+    assert found["search.ms_at_100_times_the_town"] == towns / found["search.views_2880.scan_ms"]
+    assert found["search.ms_at_100_times_the_indexed_town"] == towns / found["search.views_2880.index_ms"]
 
 
 def test_copies_of_a_town_lie_apart_and_share_the_scans(small_dataset: Dataset, tmp_path: Path) -> None:
