@@ -14,7 +14,7 @@ from benchmarks.scale.drawn import Asked, DrawnViews
 from benchmarks.scale.sources import HEADINGS, RealDescriptors
 from service.maps.index import ScannedCopy, Shortlister, search_with_one_thread, vectors_of
 from service.maps.inverted_file import InvertedFile, write_inverted_file
-from service.maps.tiles import LISTED, MOST_SEARCHED, in_order
+from service.maps.tiles import LISTED, MOST_SEARCHED, PlaceSearch, in_order
 from service.retrieval.knn import SHORTLIST
 
 #: Views of the town of 1 x 1 km and 20 km of streets, and of a hundred such towns.
@@ -119,7 +119,7 @@ def _built(report: Report, numbers: DrawnViews, path: Path) -> list[Ready]:
     return [*ready, Ready(f"{row}.index", opened, asked, views)]
 
 
-def finds_tile(opened: InvertedFile, asked: Asked, views: int) -> NDArray[np.bool_]:
+def finds_tile(opened: PlaceSearch, asked: Asked, views: int) -> NDArray[np.bool_]:
     """Return for each query whether its tile is among those that a tiled map searches without a prior. The codes alone decide.
 
     Args:

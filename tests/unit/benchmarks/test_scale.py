@@ -2,6 +2,7 @@
 
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -122,7 +123,7 @@ def test_a_tile_is_found_if_it_is_among_the_first_six_of_the_list(monkeypatch: p
     """Tiles of ten views. The first query has tile 7 as the sixth tile of its list, the second as the seventh."""
     monkeypatch.setattr(search, "TILE_VIEWS", 10)
     lists = iter([np.array([0, 1, 10, 20, 30, 31, 40, 75]), np.array([0, 10, 20, 30, 40, 50, 75])])
-    fake = SimpleNamespace(most_similar=lambda _descriptor, _k: next(lists))
+    fake: Any = SimpleNamespace(most_similar=lambda _descriptor, _k: next(lists))
     asked = Asked(np.ones((2, 3, SIZE), np.float32), np.array([71, 71]))
     assert search.finds_tile(fake, asked, 100).tolist() == [True, False]
 

@@ -97,8 +97,8 @@ def test_the_build_stops_where_more_lists_find_no_more(
     probes: int,
     recall: float,
 ) -> None:
-    whole = faiss.read_index(str(written.path))
-    lists = faiss.downcast_index(whole.index)
+    whole: Any = faiss.read_index(str(written.path))
+    lists: Any = faiss.downcast_index(whole.index)
     given_recalls = iter(recalls)
     monkeypatch.setattr(inverted_file, "_LISTED", 20)
     monkeypatch.setattr(inverted_file, "recall_of", lambda *_: next(given_recalls))
