@@ -7,6 +7,7 @@ import pytest
 
 from benchmarks import provenance
 from benchmarks.provenance import MEASURED, NOT_RUN, ROOT, mark_stale, measured_paths
+from service.maps import inverted_file
 
 REPORTS = sorted((ROOT / "reports").glob("*.json"))
 
@@ -133,6 +134,11 @@ def test_a_benchmark_does_not_load_what_it_claims_not_to_run(report):
     for path in NOT_RUN[report]:
         assert (ROOT / path).exists(), path
         assert not [each for each in loaded if each.is_relative_to(ROOT / path)], path
+
+
+def test_the_maps_of_accuracy_rows_have_no_search_index():
+    """Their rows do not depend on the code of the index. With a smaller limit they would."""
+    assert inverted_file.SMALLEST >= provenance.MOST_VIEWS
 
 
 def test_the_longest_beginning_says_what_a_row_measures():
