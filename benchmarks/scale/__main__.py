@@ -66,9 +66,9 @@ def main() -> None:
         nargs="+",
         choices=PARTS,
         default=list(PARTS),
-        help="what to measure: search in drawn maps, requests with a prior on a tiled map "
-        "(served), tiled builds that are killed, and both engines (built), the memory that a build of four small towns takes (memory), a "
-        "map in object storage (store), a town of 20 km, which takes an hour (town)",
+        help="what to measure: search in drawn maps, requests with a prior on a tiled map (served), tiled builds that are killed, and both "
+        "engines (built), the memory that a build of four small towns takes (memory), a map in object storage (store), a town of 20 km, "
+        "which takes an hour (town)",
     )
     parser.add_argument(
         "--stored",

@@ -29,8 +29,8 @@ BARRED = {
 }
 #: Queries, and views that an answer takes from a search by default.
 QUERIES, WANTED = 100, 240
-#: Places of a tile, and its views.
-TILE_PLACES, TILE_VIEWS = 500, 500 * HEADINGS
+#: Views of a tile of 500 places.
+TILE_VIEWS = 500 * HEADINGS
 #: Best views that count for recall.
 BEST = 10
 #: Descriptors in memory that the exact comparison reads. The 12.5 GB of a hundred towns do not fit, so theirs are read at other places.

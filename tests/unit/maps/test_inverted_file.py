@@ -184,6 +184,29 @@ def test_a_place_that_was_appended_to_a_map_is_found(tmp_path: Path) -> None:
         assert opened.most_similar(vectors_of(numbers[view : view + 1])[0], 5)[0] == view
 
 
+def test_an_index_that_lacks_a_place_is_refused(tmp_path: Path) -> None:
+    """The forged number makes a view of place 1, which may be missing, out of one of place 2, which may not."""
+    numbers = descriptors_of(tmp_path, street_vectors(200, 4, SIZE, alike=0.97))
+    write_inverted_file(tmp_path / FILE, numbers, headings=4)
+    held = views_to_hold(numbers, 4)
+    omitted = next(view for view in range(800) if view not in held)
+    data, wanted = (tmp_path / FILE).read_bytes(), np.int64(8).tobytes()
+    whole: Any = faiss.read_index(str(tmp_path / FILE), faiss.IO_FLAG_MMAP)  # keeps its parts alive
+    inverted: Any = faiss.downcast_index(whole.index)
+    mapped: Any = faiss.downcast_InvertedLists(inverted.invlists)
+    for number in range(inverted.nlist):
+        entry = mapped.lists.at(number)
+        first = entry.offset + entry.size * inverted.code_size
+        ids = np.frombuffer(data, np.int64, entry.size, first)
+        if 8 in ids:
+            at = first + 8 * int(np.flatnonzero(ids == 8)[0])
+            assert data[at : at + 8] == wanted
+            data = data[:at] + np.int64(omitted).tobytes() + data[at + 8 :]
+    (tmp_path / FILE).write_bytes(data)
+    with pytest.raises(BundleError, match="1 views of every second place are in no list"):
+        InvertedFile.open(tmp_path / FILE, views=800, dimension=SIZE, headings=4)
+
+
 def test_a_map_with_fewer_views_than_axes_has_an_index(tmp_path: Path) -> None:
     """As the map of a few tiles with a few places each: 5 places with 4 headings and 256 numbers hold 12 views."""
     numbers = descriptors_of(tmp_path, street_vectors(5, 4, 256))
