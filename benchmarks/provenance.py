@@ -130,16 +130,20 @@ MEASURED: dict[str, dict[str, tuple[str, ...]]] = {
     },
 }
 
+#: Tiled maps, object storage and Qdrant.
+TILED_AND_STORED = (
+    "service/maps/joined_index.py",
+    "service/maps/qdrant.py",
+    "service/maps/search_address.py",
+    "service/maps/store",
+    "service/maps/tiled_writer.py",
+    "service/maps/tiles.py",
+)
 #: Files in the folders above that no row of a report runs: tiled maps, object storage, Qdrant, and commands for finished maps. A test
 #: checks that the benchmark loads none of them.
 NOT_RUN: dict[str, tuple[str, ...]] = {
     "accuracy": (
-        "service/maps/joined_index.py",
-        "service/maps/qdrant.py",
-        "service/maps/search_address.py",
-        "service/maps/store",
-        "service/maps/tiled_writer.py",
-        "service/maps/tiles.py",
+        *TILED_AND_STORED,
         "service/localization/track_bytes.py",
         "model_training/datasets/stored_survey.py",
         "model_training/datasets/survey_part.py",
@@ -160,7 +164,11 @@ NOT_RUN["real_data"] = tuple(file for file in NOT_RUN["accuracy"] if file.starts
 #: Files that only some rows of a report run, by the beginning of their ids.
 ONLY_RUN_BY: dict[str, dict[str, tuple[str, ...]]] = {
     "accuracy": {"service/localization/tracker.py": ("filter.",), "service/maps/inverted_file.py": ()},
-    "real_data": {"service/localization/tracker.py": ("real.track.", "ros2."), "service/maps/inverted_file.py": ()},
+    "real_data": {
+        "service/localization/tracker.py": ("real.track.", "ros2."),
+        "service/maps/inverted_file.py": (),
+        **dict.fromkeys(TILED_AND_STORED, ("resume.", "ros2.")),  # they start commands in processes of their own
+    },
 }
 #: No map of these reports has as many views as ``inverted_file.SMALLEST``, which a test keeps. The largest has about 160,000.
 MOST_VIEWS = 1_000_000

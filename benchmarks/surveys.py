@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.plans import hard_plan, unseen_plan
+from benchmarks.plans import BOTH, unseen_plan
 from benchmarks.report import Report
 from benchmarks.runs import Runs, accepted_within, within
 from model_training.datasets.dataset import Dataset, QueryFrame, Transforms
@@ -14,7 +14,6 @@ from model_training.evaluation.predict import Predictions, joined
 from model_training.mapping.settings import BuildSettings
 
 SPACINGS_M = (1.0, 2.0, 5.0, 10.0)
-QUERIES = "clear_precise"
 #: Number of maps of a single scan. Their scans are spread over the survey. Queries within NEAR_M of the scan are asked.
 SINGLE_SCANS, NEAR_M = 25, 5.0
 
@@ -23,14 +22,13 @@ class OneScan(Dataset):
     """A dataset whose survey is a single scan, with the queries near it.
 
     Args:
-        survey: folder of the dataset with the survey.
-        queries: dataset with the queries.
+        folder: folder of the dataset.
         number: number of the scan.
     """
 
-    def __init__(self, survey: Path, queries: Dataset, number: int) -> None:
-        super().__init__(survey)
-        self._queries, self._number = queries, number
+    def __init__(self, folder: Path, number: int) -> None:
+        super().__init__(folder)
+        self._number = number
 
     def survey_poses(self) -> Transforms:
         """Return T_map_lidar of the scan (1, 4, 4), metres."""
@@ -51,30 +49,37 @@ class OneScan(Dataset):
             name: name of the query set.
         """
         (T_map_lidar,) = self.survey_poses()
-        for frame in self._queries.queries(name):
+        for frame in super().queries(name):
             T = frame.T_map_camera
             if T is not None and np.hypot(*(T[:2, 3] - T_map_lidar[:2, 3])) <= NEAR_M:
                 yield frame
 
 
 def survey_rows(report: Report, runs: Runs) -> None:
-    """Add the rows of each survey: accepted and right, right when forced, accepted and wrong.
+    """Add the rows of each survey and depth camera: accepted and right, right when forced, accepted and wrong.
 
     Args:
         report: collects the rows.
         runs: simulates, builds and answers, or reuses what is kept on disk.
     """
-    survey, asked = runs.dataset(unseen_plan(0)), runs.dataset(hard_plan())  # the same city: hard_plan has its seed
+    survey = runs.dataset(unseen_plan(0))
     for spacing_m in SPACINGS_M:
         bundle = runs.bundle(survey, BuildSettings(name=f"survey-{spacing_m:g}-m", spacing_m=spacing_m))
-        _rows(report, f"survey.every_{spacing_m:g}_m", runs.predictions(bundle, asked, QUERIES))
-    found = []
+        for preset in BOTH:
+            _rows(report, f"survey.every_{spacing_m:g}_m.{preset}", runs.predictions(bundle, survey, _queries(preset)))
+    found: dict[str, list[Predictions]] = {preset: [] for preset in BOTH}
     for number in np.linspace(0, len(survey.survey_poses()) - 1, SINGLE_SCANS).round().astype(int):
-        single = OneScan(survey.folder, asked, int(number))
-        if any(True for _ in single.queries(QUERIES)):
+        single = OneScan(survey.folder, int(number))
+        if any(True for _ in single.queries(_queries(BOTH[0]))):
             bundle = runs.bundle(single, BuildSettings(name=f"single-scan-{number}"))
-            found.append(runs.predictions(bundle, single, QUERIES))
-    _rows(report, "survey.single_scan", joined(found))
+            for preset in BOTH:
+                found[preset].append(runs.predictions(bundle, single, _queries(preset)))
+    for preset in BOTH:
+        _rows(report, f"survey.single_scan.{preset}", joined(found[preset]))
+
+
+def _queries(preset: str) -> str:
+    return f"drive1_{preset}"
 
 
 def _rows(report: Report, row: str, found: Predictions) -> None:

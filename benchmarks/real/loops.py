@@ -5,6 +5,7 @@ from numpy.typing import NDArray
 
 from benchmarks.real.loop_drive import LoopDrive
 from benchmarks.report import Report
+from model_training.cli.progress import bars
 from model_training.odometry.find import find_trajectory
 
 SEED, LENGTH_M = 9101, 1500.0
@@ -17,8 +18,8 @@ def loop_rows(report: Report) -> None:
         report: receives the rows.
     """
     drive = LoopDrive(SEED, length_m=LENGTH_M)
-    found = find_trajectory(drive, report=lambda stage, done, of: print(f"\r{stage} {done}/{of}", end="", flush=True))
-    print()
+    with bars() as show:
+        found = find_trajectory(drive, report=show)
     truth = drive.T_map_lidar[:, :3, 3]
     before, after = (aligned_error_m(t.T_map_vehicle[:, :3, 3], truth) for t in (found.before, found.trajectory))
     report.row("loop_closure.drift_before_m", before, "m", n=len(truth))

@@ -16,6 +16,7 @@ from service.maps.content import NOT_SERVED
 from service.maps.manifest import FILE, Manifest, Tile, parsed_manifest, read_manifest
 from service.maps.store.cache import TileCache, is_used_now
 from service.maps.store.fetch import fetch_files, shared_files, shared_prefix, tile_manifest
+from service.maps.store.fetch_log import FetchLog
 from service.maps.store.remote import Remote, checked_url
 
 #: Time between two marks of an open tile as used, s.
@@ -107,8 +108,10 @@ class StoredMap:
     def _fetch_version(self, manifest: Manifest, data: bytes, into: Path) -> None:
         remote = self._opened()
         files = shared_files(manifest, f"{self.url}/{FILE}", leave_out=NOT_SERVED)
-        fetch_files(remote, shared_prefix(remote, manifest), files, into)
+        log = FetchLog("map", self.url, sum(each.size for each in files.values()))
+        fetch_files(remote, shared_prefix(remote, manifest), files, into, on_bytes=log.add)
         (into / FILE).write_bytes(data)
+        log.finish()
 
 
 class StoreTiles:
@@ -203,8 +206,10 @@ class StoreTiles:
                 os.link(shared[files[name].sha256], into / name)
                 del files[name]
         self._cache.reserve(into, {name: entry.size for name, entry in files.items()})
-        fetch_files(self._remote, f"{tile.folder}/", files, into)
+        log = FetchLog("tile", f"{self._remote.url}/{tile.folder}", sum(each.size for each in files.values()))
+        fetch_files(self._remote, f"{tile.folder}/", files, into, on_bytes=log.add)
         (into / FILE).write_bytes(data)
+        log.finish()
         self._compared.add(tile.version)
 
     def _shared_by_hash(self) -> Mapping[str, Path]:

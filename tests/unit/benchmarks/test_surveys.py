@@ -8,7 +8,7 @@ from benchmarks.surveys import NEAR_M, OneScan
 
 @pytest.fixture(scope="module")
 def single(small_dataset):
-    return OneScan(small_dataset.folder, small_dataset, 3)
+    return OneScan(small_dataset.folder, 3)
 
 
 def test_the_survey_is_the_scan(single, small_dataset):

@@ -1,6 +1,7 @@
 """A dataset in object storage: an S3 server over a socket, and files."""
 
 import errno
+import os
 import pickle
 import re
 import sys
@@ -14,7 +15,7 @@ from benchmarks.scale.s3_server import BUCKET
 from model_training.datasets.dataset import Dataset
 from model_training.datasets.stored_survey import StoredSource, StoredSurvey, dataset_at, source_of
 from model_training.datasets.survey_part import FolderSource, SurveyPart
-from service.errors import DatasetError, ExtraMissingError
+from service.errors import BundleError, DatasetError, ExtraMissingError
 from service.maps.store.remote import Remote
 
 FIRST = "survey/scans/000000.bin"
@@ -204,6 +205,20 @@ def test_a_file_that_is_written_over_while_it_is_read_is_refused(small_dataset, 
 
     with pytest.raises(DatasetError, match=r"000000\.bin has changed since the command began"):
         source.fetch_scans(tmp_path / "fetched", [0], written_over)
+
+
+@pytest.mark.parametrize("left", [50, 10, 0])
+def test_a_file_that_becomes_shorter_while_it_is_read_is_refused(tmp_path, monkeypatch, left):
+    monkeypatch.setattr("service.maps.store.remote._CHUNK", 20)
+    path = tmp_path / "a.bin"
+    path.write_bytes(bytes(100))
+    remote = Remote.open(f"file://{tmp_path}")
+    (listed,) = remote.files("")
+    with (
+        (tmp_path / "copy").open("wb") as copy,
+        pytest.raises(BundleError, match=r"a\.bin has changed since the command began; run it again"),
+    ):
+        remote.save_listed(listed, copy, on_bytes=lambda _: os.truncate(path, left))
 
 
 def test_a_file_in_a_subfolder_is_no_scan(url, small_dataset, tmp_path):

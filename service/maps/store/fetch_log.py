@@ -1,0 +1,48 @@
+"""Log lines about a fetch: one when it begins, one every few seconds, and one at the end. A service at its start shows nothing else."""
+
+import logging
+import threading
+import time
+
+#: Time between two lines about the same fetch, s.
+REPORT_EVERY_S = 10.0
+_MB = 1_000_000
+_log = logging.getLogger("streetfix.maps")
+
+
+class FetchLog:
+    """Count the bytes of one fetch, and log them. Threads may share it.
+
+    Args:
+        event: begins the names of the events, such as ``map`` for ``map_fetching`` and ``map_fetched``.
+        url: of what is fetched.
+        total: bytes of all files.
+    """
+
+    def __init__(self, event: str, url: str, total: int) -> None:
+        self._event, self._url, self._total = event, url, total
+        self._done = 0
+        self._began_s = self._told_s = time.monotonic()
+        self._lock = threading.Lock()
+        self._tell()
+
+    def add(self, size: int) -> None:
+        """Count a piece.
+
+        Args:
+            size: bytes.
+        """
+        with self._lock:
+            self._done += size
+            now_s = time.monotonic()
+            if now_s - self._told_s >= REPORT_EVERY_S:
+                self._told_s = now_s
+                self._tell()
+
+    def finish(self) -> None:
+        """Log the end of the fetch."""
+        elapsed_s = time.monotonic() - self._began_s
+        _log.info("%s_fetched url=%s mb=%.1f s=%.1f", self._event, self._url, self._done / _MB, elapsed_s)
+
+    def _tell(self) -> None:
+        _log.info("%s_fetching url=%s mb=%.1f of=%.1f", self._event, self._url, self._done / _MB, self._total / _MB)
