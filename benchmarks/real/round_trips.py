@@ -131,13 +131,17 @@ def _repeated(original: Dataset, scans: int, out: Path) -> None:
 
 
 def _import_in_process(bag: Path, out: Path) -> tuple[float, float]:
-    """Run the import command in its own process; return scans per second and peak memory (MiB)."""
+    """Run the import command in its own process; return scans per second and peak memory (MiB).
+
+    ``VmHWM`` starts anew with the command. ``ru_maxrss`` of a child begins with the memory of its parent.
+    """
     code = (
-        "import resource, sys, json, time\n"
+        "import json, pathlib, re, sys, time\n"
         "from service.cli.main import main\n"
         "began = time.perf_counter()\n"
         "try:\n    main(sys.argv[1:])\nexcept SystemExit as end:\n    assert not end.code, end.code\n"
-        "print(json.dumps([time.perf_counter() - began, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss]))"
+        "peak = re.search(r'VmHWM:\\s+(\\d+) kB', pathlib.Path('/proc/self/status').read_text())[1]\n"
+        "print(json.dumps([time.perf_counter() - began, int(peak)]))"
     )
     command = [sys.executable, "-c", code, "import", "rosbag", str(bag), "--out", str(out), "--no-pictures"]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True)
