@@ -27,6 +27,7 @@ from service.retrieval.prior import Prior
 from service.retrieval.query import DepthFormat, Query, decoded_query
 from service.retrieval.retrieve import EncodedFrame
 from service.runtime.admission import Admission
+from service.runtime.fetch_log import FetchLog
 from service.runtime.last_answers import LastAnswers
 from service.runtime.map_registry import MapRegistry
 from service.runtime.map_watcher import MapWatcher
@@ -338,7 +339,7 @@ def watcher_of(registry: MapRegistry, settings: Settings) -> MapWatcher:
     if urls := [each for each in settings.maps if isinstance(each, MapUrl)]:
         cache = TileCache(settings.tile_cache or default_folder(), settings.tile_cache_bytes)
         cache.clean()
-        stored = [StoredMap(each, cache) for each in urls]
+        stored = [StoredMap(each, cache, FetchLog) for each in urls]
     paths = [each for each in settings.maps if isinstance(each, Path)]
     return MapWatcher(
         registry,

@@ -6,7 +6,7 @@ import re
 import threading
 import time
 from collections import deque
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import suppress
 from functools import partial
 from pathlib import Path
@@ -15,13 +15,17 @@ from service.errors import BundleError
 from service.maps.content import NOT_SERVED
 from service.maps.manifest import FILE, Manifest, Tile, parsed_manifest, read_manifest
 from service.maps.store.cache import TileCache, is_used_now
-from service.maps.store.fetch import fetch_files, shared_files, shared_prefix, tile_manifest
-from service.maps.store.fetch_log import FetchLog
+from service.maps.store.fetch import OnBytes, fetch_files, shared_files, shared_prefix, tile_manifest
 from service.maps.store.remote import Remote, checked_url
 
 #: Time between two marks of an open tile as used, s.
 USED_EVERY_S = 60.0
 _UNUSUAL = re.compile(r"[^A-Za-z0-9._-]+")
+
+
+#: Follows a fetch: gets its kind ("map" for the shared files of a map, or "tile"), its URL and the bytes of all files. Returns what counts
+#: the bytes of each piece, from several threads.
+Follow = Callable[[str, str, int], OnBytes]
 
 
 class StoredMap:
@@ -34,6 +38,7 @@ class StoredMap:
     Args:
         url: such as ``s3://bucket/maps/town``.
         cache: the cache.
+        follow: follows the fetches.
 
     Attributes:
         url: as given, without a final slash.
@@ -43,9 +48,9 @@ class StoredMap:
         BundleError: the URL is not valid.
     """
 
-    def __init__(self, url: str, cache: TileCache) -> None:
+    def __init__(self, url: str, cache: TileCache, follow: Follow = lambda *_: lambda _: None) -> None:
         self.url = checked_url(url)
-        self._cache = cache
+        self._cache, self._follow = cache, follow
         key = hashlib.sha256(self.url.encode()).hexdigest()[:12]
         self.folder = cache.folder / f"{_UNUSUAL.sub('_', self.url.rpartition('/')[2])[:64]}-{key}"
         self._remote: Remote | None = None
@@ -86,7 +91,7 @@ class StoredMap:
         Args:
             version: folder of the version, in ``folder``.
         """
-        return StoreTiles(self._opened(), self._cache, version)
+        return StoreTiles(self._opened(), self._cache, version, self._follow)
 
     def forget(self, keep: Collection[str]) -> None:
         """Delete the folders of other versions than these and the current one. The bound of the cache deletes their tiles.
@@ -108,10 +113,9 @@ class StoredMap:
     def _fetch_version(self, manifest: Manifest, data: bytes, into: Path) -> None:
         remote = self._opened()
         files = shared_files(manifest, f"{self.url}/{FILE}", leave_out=NOT_SERVED)
-        log = FetchLog("map", self.url, sum(each.size for each in files.values()))
-        fetch_files(remote, shared_prefix(remote, manifest), files, into, on_bytes=log.add)
+        on_bytes = self._follow("map", self.url, sum(each.size for each in files.values()))
+        fetch_files(remote, shared_prefix(remote, manifest), files, into, on_bytes=on_bytes)
         (into / FILE).write_bytes(data)
-        log.finish()
 
 
 class StoreTiles:
@@ -121,10 +125,13 @@ class StoreTiles:
         remote: the store of the map.
         cache: the cache.
         version: folder of a version of the map in the cache.
+        follow: follows the fetches.
     """
 
-    def __init__(self, remote: Remote, cache: TileCache, version: Path) -> None:
-        self._remote, self._cache, self._version = remote, cache, version
+    def __init__(
+        self, remote: Remote, cache: TileCache, version: Path, follow: Follow = lambda *_: lambda _: None
+    ) -> None:
+        self._remote, self._cache, self._version, self._follow = remote, cache, version, follow
         self._expected = deque[Tile]()
         self._expecting = threading.Lock()
         self._fetches_ahead = False
@@ -206,10 +213,9 @@ class StoreTiles:
                 os.link(shared[files[name].sha256], into / name)
                 del files[name]
         self._cache.reserve(into, {name: entry.size for name, entry in files.items()})
-        log = FetchLog("tile", f"{self._remote.url}/{tile.folder}", sum(each.size for each in files.values()))
-        fetch_files(self._remote, f"{tile.folder}/", files, into, on_bytes=log.add)
+        on_bytes = self._follow("tile", f"{self._remote.url}/{tile.folder}", sum(each.size for each in files.values()))
+        fetch_files(self._remote, f"{tile.folder}/", files, into, on_bytes=on_bytes)
         (into / FILE).write_bytes(data)
-        log.finish()
         self._compared.add(tile.version)
 
     def _shared_by_hash(self) -> Mapping[str, Path]:

@@ -3,7 +3,6 @@
 import errno
 import hashlib
 import json
-import re
 import shutil
 import subprocess
 import sys
@@ -24,7 +23,7 @@ from service.maps.content import NOT_SERVED, BundleContent
 from service.maps.manifest import Manifest, Tile, read_manifest
 from service.maps.reader import MapBundle
 from service.maps.store import cache as cache_module
-from service.maps.store import fetch, fetch_log, remote, transfer
+from service.maps.store import fetch, remote, transfer
 from service.maps.store.cache import TileCache
 from service.maps.store.remote import Remote, checked_url
 from service.maps.store.stored_map import StoredMap, StoreTiles
@@ -494,27 +493,18 @@ def test_who_fetched_a_tile_has_compared_its_hashes(town: Path, file_url: str, c
         TiledMap.open(version, source=again).tiles.get(0)
 
 
-def test_a_fetch_is_logged_with_its_progress(
-    town: Path, file_url: str, cache: TileCache, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(fetch_log, "REPORT_EVERY_S", 0.0)
+def test_a_fetch_is_followed(town: Path, file_url: str, cache: TileCache) -> None:
     push(town, file_url)
-    with caplog.at_level("INFO", "streetfix.maps"):
-        _, _, manifest, tiles = stored(file_url, cache)
-        tiles.folder(manifest.tiles[0])
-        tiles.folder(manifest.tiles[0])  # from the cache
-    tile_url = f"{file_url}/{manifest.tiles[0].folder}"
-    for event, url in (("map", file_url), ("tile", tile_url)):
-        lines = [each for each in caplog.messages if each.startswith(event)]
-        fetching = [
-            re.fullmatch(rf"{event}_fetching url={re.escape(url)} mb=(\S+) of=(\S+)", each) for each in lines[:-1]
-        ]
-        shown = [(float(each[1]), float(each[2])) for each in fetching if each is not None]
-        assert len(shown) == len(fetching) > 2
-        assert [done for done, _ in shown] == sorted(done for done, _ in shown)
-        assert shown[0][0] == 0
-        assert shown[-1][0] == shown[-1][1] > 0
-        assert re.fullmatch(rf"{event}_fetched url={re.escape(url)} mb={shown[-1][1]:.1f} s=\d+\.\d", lines[-1])
+    followed: dict[tuple[str, str, int], list[int]] = {}
+    found = StoredMap(file_url, cache, lambda *fetch: followed.setdefault(fetch, []).append)
+    found.refresh()
+    (version,) = found.versions()
+    tiles, tile = found.tiles(version), read_manifest(version).tiles[0]
+    tiles.folder(tile)
+    tiles.folder(tile)  # from the cache
+    assert [(kind, url) for kind, url, _ in followed] == [("map", file_url), ("tile", f"{file_url}/{tile.folder}")]
+    for (_, _, total), sizes in followed.items():
+        assert sum(sizes) == total > 0
 
 
 def test_expected_tiles_are_fetched_in_the_background(town: Path, file_url: str, cache: TileCache) -> None:
