@@ -167,7 +167,7 @@ ONLY_RUN_BY: dict[str, dict[str, tuple[str, ...]]] = {
     "real_data": {
         "service/localization/tracker.py": ("real.track.", "ros2."),
         "service/maps/inverted_file.py": (),
-        **dict.fromkeys(TILED_AND_STORED, ("resume.", "ros2.")),  # they start commands in processes of their own
+        **dict.fromkeys(TILED_AND_STORED, ("resume.", "ros2.")),  # these rows start commands in processes of their own
     },
 }
 #: No map of these reports has as many views as ``inverted_file.SMALLEST``, which a test keeps. The largest has about 160,000.

@@ -13,6 +13,7 @@ from model_training.datasets.dataset import Dataset, QueryFrame, Transforms
 from model_training.evaluation.predict import Predictions, joined
 from model_training.mapping.settings import BuildSettings
 
+#: Spacings of ``build-map``. It takes a scan from nine tenths of the spacing on, so 10 m takes every ninth of these scans, 1 m apart.
 SPACINGS_M = (1.0, 2.0, 5.0, 10.0)
 #: Number of maps of a single scan. Their scans are spread over the survey. Queries within NEAR_M of the scan are asked.
 SINGLE_SCANS, NEAR_M = 25, 5.0

@@ -1,4 +1,4 @@
-"""Log lines about a fetch from object storage: one when it begins, one every few seconds, and one at the end.
+"""Log lines about a fetch from object storage: when it begins, while data arrives, and when all files are there and whole.
 
 A service that fetches a map at its start shows nothing else.
 """
@@ -6,8 +6,10 @@ A service that fetches a map at its start shows nothing else.
 import logging
 import threading
 import time
+from collections.abc import Callable
+from types import TracebackType
 
-#: Time between two lines about the same fetch, s.
+#: Least time between two lines about the same fetch, s.
 REPORT_EVERY_S = 10.0
 _MB = 1_000_000
 _log = logging.getLogger("streetfix.maps")
@@ -15,6 +17,8 @@ _log = logging.getLogger("streetfix.maps")
 
 class FetchLog:
     """Counts and logs the bytes of one fetch (``service.maps.store.stored_map.Follow``). Threads may share it.
+
+    The lines about a map have the level WARNING, as those about mounted maps, and those about a tile have the level INFO.
 
     Args:
         kind: "map" or "tile". It begins the names of the events, such as ``map_fetching`` and ``map_fetched``.
@@ -24,27 +28,40 @@ class FetchLog:
 
     def __init__(self, kind: str, url: str, total: int) -> None:
         self._kind, self._url, self._total = kind, url, total
+        self._level = logging.WARNING if kind == "map" else logging.INFO
         self._done = 0
         self._began_s = self._told_s = time.monotonic()
         self._lock = threading.Lock()
+
+    def __enter__(self) -> Callable[[int], None]:
+        """Log the begin; return what counts the bytes of a piece."""
         self._tell()
+        return self._add
 
-    def __call__(self, size: int) -> None:
-        """Count a piece.
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        """Log the end, unless the fetch failed. The caller logs why it failed."""
+        if error is None:
+            elapsed_s = time.monotonic() - self._began_s
+            _log.log(
+                self._level, "%s_fetched url=%s mb=%.1f s=%.1f", self._kind, self._url, self._done / _MB, elapsed_s
+            )
 
-        Args:
-            size: bytes.
-        """
+    def _add(self, size: int) -> None:
         with self._lock:
             self._done += size
             now_s = time.monotonic()
-            if self._done == self._total:
-                _log.info(
-                    "%s_fetched url=%s mb=%.1f s=%.1f", self._kind, self._url, self._done / _MB, now_s - self._began_s
-                )
-            elif now_s - self._told_s >= REPORT_EVERY_S:
+            if self._done < self._total and now_s - self._told_s >= REPORT_EVERY_S:
                 self._told_s = now_s
                 self._tell()
 
     def _tell(self) -> None:
-        _log.info("%s_fetching url=%s mb=%.1f of=%.1f", self._kind, self._url, self._done / _MB, self._total / _MB)
+        _log.log(
+            self._level,
+            "%s_fetching url=%s mb=%.1f of=%.1f",
+            self._kind,
+            self._url,
+            self._done / _MB,
+            self._total / _MB,
+        )

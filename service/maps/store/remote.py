@@ -336,7 +336,7 @@ class Remote:
     def _chunks(self, name: str, found: "GetResult") -> Iterator[bytes]:
         """Yield the content of an object piece by piece; errors name the object."""
         if _scheme_of(self.url) == "file":
-            yield from self._chunks_of_file(name, found.meta["size"])
+            yield from self._chunks_of_file(name, found)
             return
         with self._naming_errors(name):
             chunks = iter(found.stream(min_chunk_size=_CHUNK))
@@ -347,12 +347,17 @@ class Remote:
                 return
             yield chunk
 
-    def _chunks_of_file(self, name: str, size: int) -> Iterator[bytes]:
-        """Yield the content of a local file, or less of it if the file becomes shorter. A stream of obstore would never end then."""
+    def _chunks_of_file(self, name: str, found: "GetResult") -> Iterator[bytes]:
+        """Yield the content of a local file. A stream of obstore would never end if the file became shorter meanwhile.
+
+        Raises:
+            BundleError: the file has changed since ``found``, or cannot be read.
+        """
+        size, e_tag = found.meta["size"], found.meta["e_tag"]
         for start in range(0, size, _CHUNK):
             with self._naming_errors(name):
-                if self._store.head(name)["size"] <= start:
-                    return
+                if self._store.head(name)["e_tag"] != e_tag:
+                    raise BundleError(f"{self.url}/{name} has changed while it was read; try again", field=name)
                 chunk = bytes(self._store.get_range(name, start=start, length=min(_CHUNK, size - start)))
             yield chunk
 

@@ -7,7 +7,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable, Collection, Mapping, Sequence
-from contextlib import suppress
+from contextlib import AbstractContextManager, nullcontext, suppress
 from functools import partial
 from pathlib import Path
 
@@ -23,9 +23,14 @@ USED_EVERY_S = 60.0
 _UNUSUAL = re.compile(r"[^A-Za-z0-9._-]+")
 
 
-#: Follows a fetch: gets its kind ("map" for the shared files of a map, or "tile"), its URL and the bytes of all files. Returns what counts
-#: the bytes of each piece, from several threads.
-Follow = Callable[[str, str, int], OnBytes]
+#: Follows a fetch. Gets its kind ("map" for the shared files of a map, or "tile"), its URL and the bytes of all files. The context gives a
+#: function that is called with the number of bytes of each piece, from several threads.
+Follow = Callable[[str, str, int], AbstractContextManager[OnBytes]]
+
+
+def _unseen(*_: object) -> AbstractContextManager[OnBytes]:
+    """Follow a fetch that nobody watches."""
+    return nullcontext(lambda _: None)
 
 
 class StoredMap:
@@ -48,7 +53,7 @@ class StoredMap:
         BundleError: the URL is not valid.
     """
 
-    def __init__(self, url: str, cache: TileCache, follow: Follow = lambda *_: lambda _: None) -> None:
+    def __init__(self, url: str, cache: TileCache, follow: Follow = _unseen) -> None:
         self.url = checked_url(url)
         self._cache, self._follow = cache, follow
         key = hashlib.sha256(self.url.encode()).hexdigest()[:12]
@@ -113,8 +118,8 @@ class StoredMap:
     def _fetch_version(self, manifest: Manifest, data: bytes, into: Path) -> None:
         remote = self._opened()
         files = shared_files(manifest, f"{self.url}/{FILE}", leave_out=NOT_SERVED)
-        on_bytes = self._follow("map", self.url, sum(each.size for each in files.values()))
-        fetch_files(remote, shared_prefix(remote, manifest), files, into, on_bytes=on_bytes)
+        with self._follow("map", self.url, sum(each.size for each in files.values())) as on_bytes:
+            fetch_files(remote, shared_prefix(remote, manifest), files, into, on_bytes=on_bytes)
         (into / FILE).write_bytes(data)
 
 
@@ -213,8 +218,9 @@ class StoreTiles:
                 os.link(shared[files[name].sha256], into / name)
                 del files[name]
         self._cache.reserve(into, {name: entry.size for name, entry in files.items()})
-        on_bytes = self._follow("tile", f"{self._remote.url}/{tile.folder}", sum(each.size for each in files.values()))
-        fetch_files(self._remote, f"{tile.folder}/", files, into, on_bytes=on_bytes)
+        total = sum(each.size for each in files.values())
+        with self._follow("tile", f"{self._remote.url}/{tile.folder}", total) as on_bytes:
+            fetch_files(self._remote, f"{tile.folder}/", files, into, on_bytes=on_bytes)
         (into / FILE).write_bytes(data)
         self._compared.add(tile.version)
 

@@ -1,6 +1,7 @@
 """A dataset in object storage: an S3 server over a socket, and files."""
 
 import errno
+import hashlib
 import os
 import pickle
 import re
@@ -16,6 +17,7 @@ from model_training.datasets.dataset import Dataset
 from model_training.datasets.stored_survey import StoredSource, StoredSurvey, dataset_at, source_of
 from model_training.datasets.survey_part import FolderSource, SurveyPart
 from service.errors import BundleError, DatasetError, ExtraMissingError
+from service.maps.manifest import FileEntry
 from service.maps.store.remote import Remote
 
 FIRST = "survey/scans/000000.bin"
@@ -216,9 +218,27 @@ def test_a_file_that_becomes_shorter_while_it_is_read_is_refused(tmp_path, monke
     (listed,) = remote.files("")
     with (
         (tmp_path / "copy").open("wb") as copy,
-        pytest.raises(BundleError, match=r"a\.bin has changed since the command began; run it again"),
+        pytest.raises(BundleError, match=r"a\.bin has changed while it was read; try again"),
     ):
         remote.save_listed(listed, copy, on_bytes=lambda _: os.truncate(path, left))
+
+
+def test_a_file_that_is_replaced_while_it_is_read_is_not_mixed_with_the_new_one(tmp_path, monkeypatch):
+    monkeypatch.setattr("service.maps.store.remote._CHUNK", 20)
+    path, other = tmp_path / "a.bin", tmp_path / "new"
+    path.write_bytes(bytes(100))
+    remote = Remote.open(f"file://{tmp_path}")
+    entry = FileEntry(size=100, sha256=hashlib.sha256(bytes(100)).hexdigest())
+
+    def replace_it(_):
+        other.write_bytes(bytes(100))
+        other.replace(path)
+
+    with (
+        (tmp_path / "copy").open("wb") as copy,
+        pytest.raises(BundleError, match=r"a\.bin has changed while it was read; try again"),
+    ):
+        remote.save("a.bin", entry, copy, on_bytes=replace_it)
 
 
 def test_a_file_in_a_subfolder_is_no_scan(url, small_dataset, tmp_path):

@@ -8,7 +8,8 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from datetime import UTC, datetime
 from functools import partial
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
@@ -496,13 +497,21 @@ def test_who_fetched_a_tile_has_compared_its_hashes(town: Path, file_url: str, c
 def test_a_fetch_is_followed(town: Path, file_url: str, cache: TileCache) -> None:
     push(town, file_url)
     followed: dict[tuple[str, str, int], list[int]] = {}
-    found = StoredMap(file_url, cache, lambda *fetch: followed.setdefault(fetch, []).append)
+    ended: list[str] = []
+
+    @contextmanager
+    def follow(kind: str, url: str, total: int) -> Iterator[Callable[[int], None]]:
+        yield followed.setdefault((kind, url, total), []).append
+        ended.append(kind)
+
+    found = StoredMap(file_url, cache, follow)
     found.refresh()
     (version,) = found.versions()
     tiles, tile = found.tiles(version), read_manifest(version).tiles[0]
     tiles.folder(tile)
     tiles.folder(tile)  # from the cache
     assert [(kind, url) for kind, url, _ in followed] == [("map", file_url), ("tile", f"{file_url}/{tile.folder}")]
+    assert ended == ["map", "tile"]
     for (_, _, total), sizes in followed.items():
         assert sum(sizes) == total > 0
 
