@@ -133,9 +133,7 @@ class StoreTiles:
         follow: follows the fetches.
     """
 
-    def __init__(
-        self, remote: Remote, cache: TileCache, version: Path, follow: Follow = lambda *_: lambda _: None
-    ) -> None:
+    def __init__(self, remote: Remote, cache: TileCache, version: Path, follow: Follow = _unseen) -> None:
         self._remote, self._cache, self._version, self._follow = remote, cache, version, follow
         self._expected = deque[Tile]()
         self._expecting = threading.Lock()
