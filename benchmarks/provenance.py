@@ -169,6 +169,8 @@ ONLY_RUN_BY: dict[str, dict[str, tuple[str, ...]]] = {
         "service/maps/inverted_file.py": (),
         **dict.fromkeys(TILED_AND_STORED, ("resume.", "ros2.")),  # these rows start commands in processes of their own
     },
+    # The maps of this report are folders. Only a map in object storage is fetched.
+    "serving": {"service/maps/store": ("fuzz.",), "service/runtime/fetch_log.py": ("fuzz.",)},
 }
 #: No map of these reports has as many views as ``inverted_file.SMALLEST``, which a test keeps. The largest has about 160,000.
 MOST_VIEWS = 1_000_000
