@@ -27,7 +27,8 @@ def test_a_fetch_is_logged_at_its_begin_every_few_seconds_and_at_its_end(
     ]
 
 
-def test_a_map_is_seen_at_the_default_level(caplog: pytest.LogCaptureFixture) -> None:
+def test_a_map_is_seen_at_the_default_level(caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("service.runtime.fetch_log.time.monotonic", lambda: 100.0)
     level = Settings.model_fields["log_level"].default.upper()
     with caplog.at_level(level, "streetfix.maps"), FetchLog("map", URL, 0):
         pass
