@@ -12,6 +12,8 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
+from benchmarks.program_text import PROGRAMS, same_program
+
 ROOT = Path(__file__).resolve().parents[1]
 
 
@@ -172,6 +174,8 @@ ONLY_RUN_BY: dict[str, dict[str, tuple[str, ...]]] = {
     # The maps of this report are folders. Only a map in object storage is fetched.
     "serving": {"service/maps/store": ("fuzz.",), "service/runtime/fetch_log.py": ("fuzz.",)},
 }
+#: Rows that measure text, by the beginning of their ids. For all other rows, comments and docstrings do not count.
+TEXT: dict[str, tuple[str, ...]] = {"house": ("",), "console": ("docs.",)}
 #: No map of these reports has as many views as ``inverted_file.SMALLEST``, which a test keeps. The largest has about 160,000.
 MOST_VIEWS = 1_000_000
 
@@ -219,7 +223,12 @@ def _changes_row(report: str, row_id: str, commit: str, head: str) -> bool | Non
     if changed is None:
         return None
     others = (file for file, rows in ONLY_RUN_BY.get(report, {}).items() if not row_id.startswith(rows))
-    return _touches(_without(changed, (*NOT_RUN.get(report, ()), *others)), measured_paths(report, row_id))
+    not_run, paths = (*NOT_RUN.get(report, ()), *others), measured_paths(report, row_id)
+    text_counts = row_id.startswith(TEXT.get(report, ()))
+    return any(
+        _is_in(file, paths) and not _is_in(file, not_run) and (text_counts or not _same_program(file, *objects))
+        for file, objects in changed.items()
+    )
 
 
 def _is_checked(report: str, row_id: str, commit: str, head: str) -> bool:
@@ -245,23 +254,38 @@ def _checks() -> list[dict[str, Any]]:
     return kept
 
 
-def _touches(changed: Iterable[str], paths: tuple[str, ...]) -> bool:
-    return any(_is_in(file, paths) for file in changed)
-
-
-def _without(changed: Iterable[str], paths: tuple[str, ...]) -> list[str]:
-    return [file for file in changed if not _is_in(file, paths)]
-
-
 def _is_in(file: str, paths: tuple[str, ...]) -> bool:
     return any(file == path or file.startswith(f"{path}/") for path in paths)
 
 
 @cache
-def _changed_files(commit: str, head: str) -> frozenset[str] | None:
-    """Return files that differ between two commits, None if Git cannot tell; a change that was undone does not count."""
-    told = git("diff", "--name-only", "--no-renames", "-z", commit, head) if commit and head else None
-    return None if told is None else frozenset(told.split("\0"))
+def _changed_files(commit: str, head: str) -> dict[str, tuple[str, str]] | None:
+    """Return the files that differ between two commits; None if Git cannot tell. A change that was undone does not count.
+
+    Args:
+        commit: one commit.
+        head: the other commit.
+
+    Returns:
+        The Git objects of both versions by file. A missing version has zeros.
+    """
+    told = git("diff", "--raw", "--no-abbrev", "--no-renames", "-z", commit, head) if commit and head else None
+    if told is None:
+        return None
+    fields = told.split("\0")
+    return {
+        name: (about.split()[2], about.split()[3])
+        for about, name in zip(fields[::2], fields[1::2], strict=False)  # an empty field follows the last file
+    }
+
+
+@cache
+def _same_program(name: str, before: str, after: str) -> bool:
+    """Return whether two versions of a file, named by their Git objects, are the same program."""
+    if not name.endswith(PROGRAMS):
+        return False
+    one, other = git("cat-file", "blob", before), git("cat-file", "blob", after)
+    return one is not None and other is not None and same_program(name, one, other)
 
 
 def git(*arguments: str) -> str | None:

@@ -23,8 +23,8 @@ HEAD = """# Reports
 `make reports` writes this page from the JSON files beside it. The figures in the tables come from runs; the column *run* names the run
 that measured the row. The reasons below a table are written by people (`benchmarks/why_missed.py`), each for the one value that it names;
 when that value has changed, the page says so instead of the reason. **Stale** means that code that the row measures has changed since the
-row's commit; any change of these files counts, a comment too. *Same answers* means that code changed, but `make same-answers` compared
-both versions: maps and answers were equal to the bit. `checks/same_answers.json` names the datasets.
+row's commit. Changes of comments, docstrings and layout do not count. *Same answers* means that code changed, but `make same-answers`
+compared both versions: maps and answers were equal to the bit. `checks/same_answers.json` names the datasets.
 *Age unknown* means that Git could not tell.
 """
 

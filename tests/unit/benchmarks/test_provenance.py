@@ -69,6 +69,24 @@ def test_code_that_was_changed_back_is_the_same(repository):
     assert ages([first], commit("service/maps/a.py", "1"), "map") == [None]
 
 
+def test_comments_docstrings_and_layout_count_only_for_rows_that_measure_text(repository, monkeypatch):
+    _, commit = repository
+    monkeypatch.setitem(provenance.TEXT, "mine", ("all.",))
+    before = commit("service/maps/a.py", 'def a():\n    """Return one."""\n    return 1\n')
+    assert ages([before], commit("service/maps/a.py", "def a():\n    return 1  # one\n"), "map", "all.map") == [
+        None,
+        True,
+    ]
+    assert ages([before], commit("service/maps/a.py", "def a():\n    return 2\n"), "map") == [True]
+
+
+def test_a_new_or_missing_file_counts(repository):
+    (_, _, third), commit = repository
+    head = commit("service/maps/new.py", "")
+    assert ages([third], head, "map") == [True]
+    assert ages([head], third, "map") == [True]
+
+
 def test_a_stale_mark_is_removed_from_a_row_that_is_measured_again(repository):
     (_, second, third), _ = repository
     row = {"id": "map", "run": "r", "stale": True}
@@ -113,7 +131,7 @@ def test_git_is_asked_once_for_a_commit(repository, monkeypatch):
     asked = []
     monkeypatch.setattr(provenance, "git", lambda *arguments: asked.append(arguments) or "")
     ages([first], third, *(f"row{number}" for number in range(50)))
-    assert len(asked) == 1
+    assert [each[0] for each in asked] == ["diff"]
 
 
 def test_every_report_says_what_its_rows_measure_and_that_is_there():
