@@ -83,12 +83,20 @@ _CORE = (
 )
 _DATA = ("model_training/simulation", "model_training/datasets", "model_training/mapping", "model_training/evaluation")
 _ALL = ("streetfix", "service", "model_training", "native")
+#: Rows of real drives for which a calibration is made.
+_OF_CALIBRATED = (
+    "real.calibrated_on_0005.",
+    "real.ece_after_rig_calibration",
+    *(f"real.kitti_{drive}.ece_after_rig_calibration" for drive in ("0005", "0013")),
+)
 #: Paths that the rows of each report measure, by the beginning of their ids. The longest match counts; "" matches all
 #: other rows. The benchmark programs are left out: a row is as old as the code that it measures.
 MEASURED: dict[str, dict[str, tuple[str, ...]]] = {
     "accuracy": {
         "": (*_CORE, *_DATA),
         "real.": (*_CORE, "model_training/importing", "model_training/datasets", "model_training/mapping"),
+        "rig.": (*_CORE, *_DATA, "model_training/calibration"),
+        "rigs.": (*_CORE, *_DATA, "model_training/calibration"),
         "trained_on_paper_city.": (*_CORE, *_DATA, "model_training/training"),
     },
     "choices": {"": (*_CORE, *_DATA, "model_training/training")},
@@ -103,6 +111,7 @@ MEASURED: dict[str, dict[str, tuple[str, ...]]] = {
             "model_training/simulation",
             "model_training/evaluation/disparity_errors.py",
         ),
+        **dict.fromkeys(_OF_CALIBRATED, (*_CORE, *_DATA, "model_training/importing", "model_training/calibration")),
         "real.peers.": (*_CORE, *_DATA, "model_training/importing", "research/baselines"),
         "ros2.": (*_CORE, "service/bridge"),
     },

@@ -59,6 +59,18 @@ def test_a_version_runs_its_own_code_only(tmp_path):
         Version(tmp_path, tmp_path / "work").run("--help")
 
 
+def test_both_versions_run_the_program_of_several_frames(tmp_path, monkeypatch):
+    """The program is a text that starts with the code of a version. It writes answers, which are compared."""
+    started: list[list[str]] = []
+    monkeypatch.setattr(same_answers.subprocess, "run", lambda command, **_: started.append(command))
+    folder = Version(tmp_path, tmp_path / "work").answers_of_frames()
+    (command,) = started
+    assert command[-1] == str(folder)
+    assert folder.is_dir()
+    assert "root = pathlib.Path" in command[2]
+    assert "def right_prior" in command[2]
+
+
 def test_changes_that_are_not_committed_are_refused(monkeypatch, capsys):
     monkeypatch.setattr(same_answers, "is_dirty", lambda: True)
     with pytest.raises(SystemExit):
@@ -88,6 +100,7 @@ def test_a_difference_fails_and_leaves_no_record(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(same_answers, "head_commit", lambda: "e" * 40)
     monkeypatch.setattr(same_answers, "SIMULATED", same_answers.SIMULATED[:1])
     monkeypatch.setattr(Version, "answers", lambda version, *_: found[version.work.name.removeprefix("answers_")])
+    monkeypatch.setattr(Version, "answers_of_frames", lambda _: found["before"])
     arguments = ["--before", "HEAD", "--data", str(tmp_path)]
     assert main(arguments) == 1
     assert "the map's file cloud differs" in capsys.readouterr().out
@@ -95,18 +108,19 @@ def test_a_difference_fails_and_leaves_no_record(tmp_path, monkeypatch, capsys):
     found["after"] = found["before"]
     assert main(arguments) == 0
     (kept,) = json.loads(checks.read_text())
-    assert (kept["before"], kept["after"], kept["queries"]) == ("f" * 40, "e" * 40, {"city": 2})
+    assert (kept["before"], kept["after"], kept["queries"]) == ("f" * 40, "e" * 40, {"city": 2, "frames": 2})
 
 
 def test_a_commit_during_the_check_leaves_no_record(tmp_path, monkeypatch, capsys):
     """The record would name code that was not compared."""
-    commits = iter(["e" * 40, "d" * 40])
+    commits, names = iter(["e" * 40, "d" * 40]), iter(["one", "other"])
     monkeypatch.setattr(same_answers, "CHECKS", tmp_path / "same_answers.json")
     monkeypatch.setattr(same_answers, "is_dirty", lambda: False)
     monkeypatch.setattr(same_answers, "git", lambda *_: "f" * 40)
     monkeypatch.setattr(same_answers, "head_commit", lambda: next(commits))
     monkeypatch.setattr(same_answers, "work_tree", lambda *_: None)
     monkeypatch.setattr(same_answers, "SIMULATED", ())
+    monkeypatch.setattr(Version, "answers_of_frames", lambda _: written(tmp_path / "frames" / next(names)))
     assert main(["--before", "HEAD", "--data", str(tmp_path)]) == 1
     assert "start it again" in capsys.readouterr().out
     assert not (tmp_path / "same_answers.json").exists()
