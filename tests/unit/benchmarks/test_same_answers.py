@@ -62,7 +62,7 @@ def test_a_version_runs_its_own_code_only(tmp_path):
 def test_both_versions_run_the_program_of_several_frames(tmp_path, monkeypatch):
     """The program is a text that starts with the code of a version. It writes answers, which are compared."""
     started: list[list[str]] = []
-    monkeypatch.setattr(same_answers.subprocess, "run", lambda command, **_: started.append(command))
+    monkeypatch.setattr(subprocess, "run", lambda command, **_: started.append(command))
     folder = Version(tmp_path, tmp_path / "work").answers_of_frames()
     (command,) = started
     assert command[-1] == str(folder)
