@@ -4,8 +4,9 @@ from pathlib import Path
 
 from benchmarks.coverage import Coverage, coverage_rows, worst_coverage_rows
 from benchmarks.report import Report
-from model_training.calibration.cross_check import cross_check
-from model_training.calibration.families import NOT_FITTED
+from model_training.calibration.cross_check import cross_check, cross_check_groups
+from model_training.calibration.families import NOT_FITTED, related
+from model_training.calibration.fit import CalibrationData
 from model_training.calibration.make import collected
 from model_training.cli.progress import bars
 
@@ -21,7 +22,8 @@ def rig_rows(report: Report, encoder: Path, work: Path) -> None:
     """Add the rows of all rig families.
 
     The data are those of the calibration. Each family's figures come from a fit without this family. Families that the calibration is not
-    fitted to count as well. The repeating blocks have rows but do not count as the worst.
+    fitted to count as well. The repeating blocks have rows but do not count as the worst. The rows ``rigs.without.*`` leave out all
+    families that share a LiDAR, a camera, a depth type or a survey spacing.
 
     Args:
         report: collects the rows.
@@ -56,3 +58,20 @@ def rig_rows(report: Report, encoder: Path, work: Path) -> None:
     report.row("rigs.worst_fitted_ece", worst_fitted.ece, "share", better="lower", why=worst_fitted.family)
     least = min((each for each in rigs if each.family not in APART), key=lambda each: each.within_1_m)
     report.row("rigs.worst_within_1_m", least.within_1_m, "share", bar=_WORST_WITHIN, why=least.family)
+    _group_rows(report, data)
+
+
+def _group_rows(report: Report, data: CalibrationData) -> None:
+    """Add the rows of families that are left out together."""
+    groups = related()
+    found = cross_check_groups(data, groups, not_fitted=NOT_FITTED)
+    for each in found:
+        row, why = f"rigs.without.{each.family}", ", ".join(n for n in groups[each.family] if n not in NOT_FITTED)
+        report.row(f"{row}.ece", each.ece, "share", better="lower", n=each.inside + each.outside, why=why)
+        refused = each.right_but_refused
+        report.row(f"{row}.right_but_refused", refused, "share", better="lower", n=each.inside, why=why)
+        accepted = round(each.localized * each.inside + each.outside_accepted * each.outside)
+        report.row(f"{row}.wrong_of_localized", each.wrong_of_localized, "share", better="lower", n=accepted, why=why)
+    if found:
+        worst = max(found, key=lambda each: each.ece)
+        report.row("rigs.without.worst_ece", worst.ece, "share", better="lower", why=worst.family)

@@ -1,6 +1,6 @@
 """Predict each rig family by a calibration that was fitted without it: what a user with another rig can expect."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -58,6 +58,36 @@ def cross_check(
         own = data.family == family
         calibration = fit(data.where(usable & ~own), measured_on={})
         found.append(figures_of(str(family), data.where(own), calibration, false_accept_rate))
+    return found
+
+
+def cross_check_groups(
+    data: CalibrationData,
+    groups: Mapping[str, Sequence[str]],
+    *,
+    not_fitted: Sequence[str] = (),
+    false_accept_rate: float = FALSE_ACCEPT_RATE,
+) -> list[FamilyFigures]:
+    """Predict each group of rig families from the families outside of it: what a LiDAR, a camera or a depth type of a new kind can expect.
+
+    Args:
+        data: calibration data of all families.
+        groups: names of the families of each group, by the name of the group. Families without data do not count.
+        not_fitted: names of the families that take part in no fit. They do not count in a group either.
+        false_accept_rate: the rate whose threshold decides the status.
+
+    Returns:
+        The figures of each group with two families or more. For one family, ``cross_check`` has the same figures.
+
+    Raises:
+        DatasetError: the other families lack right answers, wrong answers, queries in the map or out-of-map queries.
+    """
+    usable, found = ~np.isin(data.family, not_fitted), []
+    for name, families in groups.items():
+        own = np.isin(data.family, families) & usable
+        if len(np.unique(data.family[own])) > 1:
+            calibration = fit(data.where(usable & ~own), measured_on={})
+            found.append(figures_of(name, data.where(own), calibration, false_accept_rate))
     return found
 
 

@@ -4,9 +4,11 @@ A confidence that is fitted on one rig holds for this rig only. So the calibrati
 without it (``cross_check``). Those figures say what a user with a rig of his own can expect.
 """
 
+from collections import defaultdict
 from dataclasses import dataclass
 
-from model_training.calibration.plans import SEQUENCE
+from model_training.calibration.plans import BOTH, SEQUENCE, calibration_plan
+from model_training.calibration.rigs import RIGS
 from model_training.simulation.depth_noise import DepthModel
 from model_training.simulation.plan import CameraPlan, QueryPlan, SimulationPlan
 from model_training.simulation.sensor_parameters import (
@@ -71,6 +73,17 @@ class Family:
     def matched(self) -> bool:
         """Whether its depth comes from rendered and matched image pairs."""
         return self.stereo != _MODELLED
+
+    @property
+    def depth_type(self) -> str:
+        """How its depth is measured, in one word or two."""
+        if self.matched:
+            return "stereo_matching"
+        if self.beams:
+            return "spinning_lidar"
+        if self.depth.scale_error:
+            return "monocular"
+        return "modelled_stereo" if self.depths == ("stereo",) else "rgbd"
 
     def depth_model(self) -> DepthModel:
         """Return the modelled depth camera that measures walls and rooms. For stereo matchers it is the preset ``stereo``."""
@@ -143,6 +156,41 @@ FAMILIES = (
 
 #: Names of the families that the calibration is not fitted to.
 NOT_FITTED = tuple(family.name for family in FAMILIES if not family.fitted)
+
+
+def related() -> dict[str, tuple[str, ...]]:
+    """Return the families that share a LiDAR model, a camera, a depth type or a survey spacing.
+
+    A family that was left out of a fit is predicted too well if a relative with the same sensor takes part in it. So these families are
+    left out together (``cross_check``).
+
+    Returns:
+        Names of two or more families, by the factor and the value that they share, such as ``lidar.hdl_64``.
+    """
+    plan, sharing = calibration_plan(0), defaultdict[str, list[str]](list)
+    city = {"lidar": plan.lidar, "spacing": f"{plan.spacing_m:g}_m"}
+    shared = {
+        name: city | {"camera": _named(plan.camera), "depth": depth}
+        for name, depth in zip(BOTH, ("rgbd", "modelled_stereo"), strict=True)
+    }
+    shared |= {rig.name: city for rig in RIGS}
+    shared |= {
+        each.name: {
+            "lidar": each.lidar,
+            "camera": _named(each.camera),
+            "depth": each.depth_type,
+            "spacing": f"{each.spacing_m:g}_m",
+        }
+        for each in FAMILIES
+    }
+    for family, values in shared.items():
+        for factor, value in values.items():
+            sharing[f"{factor}.{value}"].append(family)
+    return {key: tuple(names) for key, names in sharing.items() if len(names) > 1}
+
+
+def _named(camera: CameraPlan) -> str:
+    return f"{camera.width}x{camera.height}_{camera.horizontal_deg:g}_deg"
 
 
 def family_plan(

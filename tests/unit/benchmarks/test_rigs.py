@@ -31,8 +31,9 @@ def family(name, seed, *, count=1000):
 
 @pytest.fixture
 def rows(monkeypatch, tmp_path, encoder_file):
-    data = pooled([family("car", 1), family("rings", 2), family("robot", 3)])
+    data = pooled([family("car", 1), family("rings", 2), family("robot", 3), family("lorry", 4)])
     monkeypatch.setattr(rigs, "collected", lambda *_, **__: data)
+    monkeypatch.setattr(rigs, "related", lambda: {"lidar.hdl": ("car", "rings", "robot"), "depth.none": ("rings",)})
     report = Report("accuracy", "make evaluate")
     rigs.rig_rows(report, encoder_file, tmp_path)
     return {row["id"]: row for row in report.rows}
@@ -47,15 +48,26 @@ def test_every_family_has_its_rows(rows):
         assert rows[f"rigs.{name}.sigma_coverage_gap"]["value"] < 0.1
 
 
+def test_families_with_the_same_sensor_are_left_out_together(rows):
+    """The group has two families that are fitted, and the third takes part in no fit. A group of one has no row."""
+    assert rows["rigs.without.lidar.hdl.ece"]["n"] == 2000
+    assert rows["rigs.without.lidar.hdl.ece"]["why"] == "car, robot"
+    assert rows["rigs.without.lidar.hdl.ece"]["value"] < 0.1
+    assert rows["rigs.without.worst_ece"]["value"] == rows["rigs.without.lidar.hdl.ece"]["value"]
+    assert not [row for row in rows if row.startswith("rigs.without.depth")]
+
+
 def test_the_worst_family_is_named(rows):
     """The calibration is not fitted to sparse rings. They count for the calibration error all the same."""
 
     def worst_of(*names):
         return max(names, key=lambda name: rows[f"rigs.{name}.ece"]["value"])
 
-    assert rows["rigs.worst_ece"]["why"] == worst_of("car", "rings", "robot")
-    assert rows["rigs.worst_fitted_ece"]["why"] == worst_of("car", "robot")
-    assert rows["rigs.worst_within_1_m"]["why"] in ("car", "robot")
+    assert rows["rigs.worst_ece"]["why"] == worst_of("car", "rings", "robot", "lorry")
+    assert rows["rigs.worst_fitted_ece"]["why"] == worst_of("car", "robot", "lorry")
+    assert rows["rigs.worst_within_1_m"]["why"] in ("car", "robot", "lorry")
     gap = rows["rigs.worst_sigma_coverage_gap"]
-    assert gap["value"] == max(rows[f"rigs.{name}.sigma_coverage_gap"]["value"] for name in ("car", "rings", "robot"))
+    assert gap["value"] == max(
+        rows[f"rigs.{name}.sigma_coverage_gap"]["value"] for name in ("car", "rings", "robot", "lorry")
+    )
     assert rows[f"rigs.{gap['why']}.sigma_coverage_gap"]["value"] == gap["value"]

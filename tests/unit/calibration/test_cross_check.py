@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from model_training.calibration.cross_check import FamilyFigures, accepted, cross_check, table
+from model_training.calibration.cross_check import FamilyFigures, accepted, cross_check, cross_check_groups, table
 from model_training.calibration.fit import CalibrationData, confidences, fit, pooled
 from service.confidence.features import FEATURES
 
@@ -72,6 +72,17 @@ def test_a_family_that_is_not_fitted_changes_no_other_family():
     found = {each.family: each for each in cross_check(pooled([*others, odd]), not_fitted=("odd",))}
     assert found["one"] == alone["one"]
     assert found["odd"].ece > 0.3
+
+
+def test_relatives_are_left_out_together():
+    """Two odd families predict each other, unless both are left out. A group of one family has no row."""
+    odd = [family(name, seed, upside_down=True) for name, seed in (("odd", 3), ("odder", 4))]
+    data = pooled([family("one", 1), family("two", 2), *odd])
+    groups = {"lidar.odd": ("odd", "odder"), "lidar.alone": ("one",), "lidar.absent": ("one", "nobody")}
+    (together,) = cross_check_groups(data, groups)
+    assert (together.family, together.inside, together.outside) == ("lidar.odd", 2000, 2000)
+    assert together.ece > 0.3
+    assert cross_check_groups(data, groups, not_fitted=("odder",)) == []
 
 
 def test_the_table_has_the_worst_family_first():

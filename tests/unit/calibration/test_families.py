@@ -1,6 +1,6 @@
 import pytest
 
-from model_training.calibration.families import FAMILIES, FAMILY_CITIES, Family, family_plan
+from model_training.calibration.families import FAMILIES, FAMILY_CITIES, Family, family_plan, related
 from model_training.calibration.plans import SEQUENCE
 from model_training.simulation.stereo_pair import STEREOS
 
@@ -49,3 +49,14 @@ def test_walls_and_rooms_have_the_depth_of_the_family(family: Family):
     else:
         assert family.depths == (model.name,)
         assert model.max_range_m == (family.depth.max_range_m or 40.0)
+
+
+def test_relatives_share_a_lidar_a_camera_a_depth_type_or_a_spacing():
+    groups = related()
+    assert groups["lidar.hdl_64"] == ("car", "car_sparse")
+    assert groups["lidar.vlp_16"] == ("zed2", "d455", "vlp_16")
+    assert groups["spacing.2.5_m"] == ("car", "four_cameras")
+    assert groups["depth.stereo_matching"] == ("car", "car_sparse", "robot", "zed2", "oak_d", "lorry")
+    assert groups["lidar.paper_32"] == ("precise", "stereo", "narrow")
+    assert "lidar.pandar_64" not in groups  # one family only: its own row leaves it out
+    assert "depth.monocular" not in groups
