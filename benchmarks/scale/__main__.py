@@ -15,18 +15,19 @@ from benchmarks.report import ROOT, Report
 from benchmarks.runs import SIMULATION, Runs, code_hash
 from benchmarks.scale.built import built_rows, four_towns_row, timed_plan
 from benchmarks.scale.drawn import DrawnViews
+from benchmarks.scale.growth import growth_rows
 from benchmarks.scale.search import SIZES, search_rows
 from benchmarks.scale.served import served_rows
 from benchmarks.scale.sources import RealDescriptors, real_descriptors, small_city
 from benchmarks.scale.store import store_rows
-from benchmarks.scale.town import town_rows
+from benchmarks.scale.town import town_folder, town_plan, town_rows
 from model_training.datasets.dataset import Dataset
 from model_training.stock import ENCODER
 from service.maps.index import vectors_of
 from service.retrieval.encoder import Encoder
 
 #: Parts of the report.
-PARTS = ("search", "served", "built", "memory", "store", "town")
+PARTS = ("search", "served", "built", "memory", "store", "town", "growth")
 #: Code that determines the real descriptors.
 _DESCRIBING = (*SIMULATION, "service/imaging", "benchmarks/scale/sources.py", "model_training/mapping/places.py")
 
@@ -68,7 +69,7 @@ def main() -> None:
         default=list(PARTS),
         help="what to measure: search in drawn maps, requests with a prior on a tiled map (served), tiled builds that are killed, and both "
         "engines (built), the memory that a build of four small towns takes (memory), a map in object storage (store), a town of 20 km, "
-        "which takes an hour (town)",
+        "which takes an hour (town), retrieval in parts of this town (growth)",
     )
     parser.add_argument(
         "--stored",
@@ -103,6 +104,12 @@ def main() -> None:
         report.write()
     if "town" in arguments.only:
         town_rows(report, Runs(arguments.work, ENCODER))
+        report.write()
+    if "growth" in arguments.only:
+        runs = Runs(arguments.work, ENCODER)
+        if not (folder := town_folder(runs)).exists():
+            parser.error("--only growth: needs the map of the town; add the part town")
+        growth_rows(report, folder, runs.dataset(town_plan()))
         report.write()
 
 

@@ -45,6 +45,15 @@ def town_plan() -> SimulationPlan:
     return SimulationPlan(name="town", seed=EVALUATION_SEEDS[50], size_m=TOWN_M, queries=queries)
 
 
+def town_folder(runs: Runs) -> Path:
+    """Return the folder of the town's map, which depends on the encoder and the code of the map build.
+
+    Args:
+        runs: the encoder, and the folder of maps.
+    """
+    return runs.work / "maps" / f"town-tiled-{Encoder.open(runs.encoder).sha256[:12]}-{code_hash(*MAPPING)}"
+
+
 def town_rows(report: Report, runs: Runs) -> None:
     """Build the town if it is not kept, and add all its rows.
 
@@ -52,9 +61,7 @@ def town_rows(report: Report, runs: Runs) -> None:
         report: collects the rows. It is written after each step.
         runs: simulates and answers, or reuses what is kept on disk.
     """
-    dataset = runs.dataset(town_plan())
-    encoder = Encoder.open(runs.encoder).sha256[:12]
-    folder = runs.work / "maps" / f"town-tiled-{encoder}-{code_hash(*MAPPING)}"
+    dataset, folder = runs.dataset(town_plan()), town_folder(runs)
     if not folder.exists():
         _build(report, dataset, folder)
         report.write()
