@@ -69,11 +69,12 @@ def town_rows(report: Report, runs: Runs) -> None:
     metres = read.counts.places * read.spacing_m
     report.row(
         "town.kb_per_metre",
-        _served_bytes(folder, read) / 1e3 / metres,
+        served_bytes(folder, read) / 1e3 / metres,
         "kB/m",
         bar=25,
         better="lower",
-        why=f"{len(read.tiles)} tiles of {TILE_M:g} m, {metres / 1e3:.1f} km of streets",
+        why=f"{len(read.tiles)} tiles of {TILE_M:g} m, {metres / 1e3:.1f} km of streets; equal files, such as the encoder of each tile, "
+        "are links to one file and count once",
     )
     _open_rows(report, folder, dataset)
     report.write()
@@ -125,10 +126,21 @@ def memory_of_tree(pid: int) -> int:
     return total
 
 
-def _served_bytes(folder: Path, read: Manifest) -> int:
-    """Return the size of the files that the service reads."""
+def served_bytes(folder: Path, read: Manifest) -> int:
+    """Return the size of the files that the service reads, bytes. Files with one hash are one file, with a link in each tile.
+
+    Args:
+        folder: folder of the tiled map.
+        read: its manifest.
+    """
     tiles = [read_manifest(folder / tile.folder).files for tile in read.tiles]
-    return sum(entry.size for files in (read.files, *tiles) for name, entry in files.items() if name not in NOT_SERVED)
+    served = {
+        entry.sha256: entry.size
+        for files in (read.files, *tiles)
+        for name, entry in files.items()
+        if name not in NOT_SERVED
+    }
+    return sum(served.values())
 
 
 def _open_rows(report: Report, folder: Path, dataset: Dataset) -> None:

@@ -36,8 +36,8 @@ def write_tiled(
 ) -> Manifest:
     """Write a tiled map and return its manifest.
 
-    The files of the tiles become hard links, or copies where the file system has no links. The map appears under ``out`` complete or not
-    at all, as with ``write_bundle``.
+    The files of the tiles become hard links, or copies where the file system has no links. Equal files, such as the encoder of each tile,
+    become one file with several links. The map appears under ``out`` complete or not at all, as with ``write_bundle``.
 
     Args:
         out: folder of the map.
@@ -62,11 +62,12 @@ def write_tiled(
             raise BundleError(f"{folder}: {different[0]} differs from {folders[0]}; {_REMEDY}", field="tiles")
     remedy = "free disk space or choose another folder"
     with in_place(out, f"{out}: the map cannot be written", remedy) as partial:
+        links = _Links()
         entries = [
-            _link_tile(partial, folder, each, square)
+            _link_tile(partial, folder, each, square, links)
             for square, folder, each in zip(squares, folders, manifests, strict=True)
         ]
-        made = _write_shared(partial, entries, manifests, tile_m, name, rig)
+        made = _write_shared(partial, entries, manifests, tile_m, name, rig, links)
         partial.chmod(0o755)
     return made
 
@@ -79,7 +80,49 @@ def _opened(folder: Path) -> Manifest:
     return read
 
 
-def _link_tile(map_folder: Path, folder: Path, read: Manifest, square: tuple[int, int]) -> Tile:
+class _Links:
+    """Links files into a map. Files with one hash become one file: each tile brings its own copy of the encoder and of the streets."""
+
+    def __init__(self) -> None:
+        self._first: dict[str, Path] = {}  # the first file in the map with a hash
+        self._intact: set[Path] = set()
+
+    def add(self, source: Path, target: Path, sha256: str) -> None:
+        """Link a file into the map.
+
+        Args:
+            source: the file.
+            target: the new file in the map.
+            sha256: hash of the file by its manifest.
+        """
+        link_or_copy(self._known(sha256) or source, target)
+        self._first.setdefault(sha256, target)
+
+    def join(self, file: Path, sha256: str) -> None:
+        """Replace a file of the map by a link to an equal one, if there is one.
+
+        Args:
+            file: the file.
+            sha256: its hash.
+        """
+        known = self._known(sha256)
+        if known is not None and not known.samefile(file):
+            file.unlink()
+            link_or_copy(known, file)
+
+    def _known(self, sha256: str) -> Path | None:
+        """Return a file of the map with a hash. A damaged file is no replacement for an intact one, so its content is compared once."""
+        known = self._first.get(sha256)
+        if known is None or known in self._intact:
+            return known
+        if sha256_of(known) != sha256:
+            del self._first[sha256]
+            return None
+        self._intact.add(known)
+        return known
+
+
+def _link_tile(map_folder: Path, folder: Path, read: Manifest, square: tuple[int, int], links: _Links) -> Tile:
     """Link the files of a tile into the map; return its entry in the manifest."""
     target = map_folder / TILES_FOLDER / read.version
     if target.exists():
@@ -87,9 +130,10 @@ def _link_tile(map_folder: Path, folder: Path, read: Manifest, square: tuple[int
             f"{folder}: another tile has the same content ({read.version}); give each square its own tile",
             field="tiles",
         )
-    for name in (*sorted(read.files), manifest.FILE):
+    for name, entry in sorted(read.files.items()):
         (target / name).parent.mkdir(parents=True, exist_ok=True)
-        link_or_copy(folder / name, target / name)
+        links.add(folder / name, target / name, entry.sha256)
+    link_or_copy(folder / manifest.FILE, target / manifest.FILE)
     for each in {(target / name).parent for name in read.files} | {target, target.parent}:
         sync(each)
     return Tile(
@@ -108,6 +152,7 @@ def _write_shared(
     tile_m: float,
     name: str,
     rig: RigCorrection | None,
+    links: _Links,
 ) -> Manifest:
     """Write the shared files and the manifest; return the manifest."""
     first, bundles = manifests[0], [folder / tile.folder for tile in tiles]
@@ -140,11 +185,12 @@ def _write_shared(
         parameters[inverted_file.RECALL] = inverted_file.write_inverted_file(
             folder / inverted_file.FILE, rows, headings=first.headings
         )
-    for each in names:
-        sync(folder / each)
     files = {
         each: FileEntry(sha256=sha256_of(folder / each), size=(folder / each).stat().st_size) for each in sorted(names)
     }
+    for each, entry in files.items():
+        links.join(folder / each, entry.sha256)
+        sync(folder / each)
     made = first.model_copy(
         update={
             "name": name,

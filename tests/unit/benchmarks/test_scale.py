@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from benchmarks.report import Report
-from benchmarks.scale import growth, search
+from benchmarks.scale import search, town
 from benchmarks.scale.built import APART_M, copied
 from benchmarks.scale.drawn import Asked, DrawnViews, _step
 from benchmarks.scale.sources import HEADINGS, RealDescriptors
@@ -150,26 +150,31 @@ def test_all_sizes_are_built_and_then_timed(
     assert found["search.ms_at_100_times_the_indexed_town"] == towns / found["search.views_2880.index_ms"]
 
 
+def test_equal_files_of_a_tiled_map_count_once(tmp_path: Path) -> None:
+    """Two tiles share the encoder (100 bytes) with the map. Previews and sums of voxels do not count: 100 + 7 + 30 + 40 bytes."""
+    of_map = {"encoder.onnx": ("a", 100), "places.npy": ("b", 7)}
+    of_tiles = [
+        {"encoder.onnx": ("a", 100), "views.npy": ("c", 30), "preview.webp": ("d", 1000)},
+        {"encoder.onnx": ("a", 100), "views.npy": ("e", 40), "voxels.zst": ("f", 1000)},
+    ]
+    entries = [
+        {name: SimpleNamespace(sha256=sha256, size=size) for name, (sha256, size) in files.items()}
+        for files in (of_map, *of_tiles)
+    ]
+    read: Any = SimpleNamespace(files=entries[0], tiles=[SimpleNamespace(folder="0"), SimpleNamespace(folder="1")])
+    by_folder = {tmp_path / str(number): SimpleNamespace(files=entries[number + 1]) for number in range(2)}
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(town, "read_manifest", by_folder.__getitem__)
+        assert town.served_bytes(tmp_path, read) == 177
+
+
 def test_copies_of_a_town_lie_apart_and_share_the_scans(small_dataset: Dataset, tmp_path: Path) -> None:
-    town, poses = small_dataset, small_dataset.survey_poses()
-    both = copied(town, tmp_path / "both", 2)
+    one, poses = small_dataset, small_dataset.survey_poses()
+    both = copied(one, tmp_path / "both", 2)
     copied_stamps, copied_poses = both.survey_trajectory()
     assert len(copied_poses) == 2 * len(poses)
     np.testing.assert_allclose(copied_poses[: len(poses)], poses, atol=1e-6)
     np.testing.assert_allclose(copied_poses[len(poses) :, :3, 3], poses[:, :3, 3] + [APART_M, 0, 0], atol=1e-6)
     assert (np.diff(copied_stamps) > 0).all()
-    np.testing.assert_array_equal(both.scan(len(poses)), town.scan(0))
-    assert scan_path(both.folder, 0).stat().st_ino == scan_path(town.folder, 0).stat().st_ino
-
-
-def test_a_place_is_as_similar_as_its_best_view_at_the_best_turn():
-    vectors = np.array([[1, 0], [0, 1], [-1, 0], [0.6, 0.8]], np.float32)  # two views of each place
-    turns = np.array([[0, -1], [1, 0]], np.float32)
-    np.testing.assert_allclose(growth.place_similarity(vectors, turns, 2), [1.0, 0.6])
-
-
-def test_the_rank_of_the_right_place_counts_the_places_before_it():
-    similarity = np.array([0.9, 0.5, 0.7, 0.5], np.float32)
-    assert growth.rank_of_right(similarity, np.array([True, False, False, False])) == 0
-    assert growth.rank_of_right(similarity, np.array([False, True, False, True])) == 2
-    assert growth.rank_of_right(similarity, np.zeros(4, np.bool_)) == 4
+    np.testing.assert_array_equal(both.scan(len(poses)), one.scan(0))
+    assert scan_path(both.folder, 0).stat().st_ino == scan_path(one.folder, 0).stat().st_ino

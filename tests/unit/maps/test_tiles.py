@@ -284,6 +284,35 @@ def test_the_same_tiles_give_the_same_version(
     assert fewer.version != again.version
 
 
+def test_equal_files_of_tiles_are_one_file(squares: dict[tuple[int, int], Path], tiled_path: Path) -> None:
+    """Each tile brings its own copy of the encoder and of the calibration. In the map they are links."""
+    read = read_manifest(tiled_path)
+    folders = [tiled_path / tile.folder for tile in read.tiles]
+    assert len({(path / "encoder.onnx").stat().st_ino for path in squares.values()}) == len(squares) > 1
+    for name in ("encoder.onnx", "calibration.json"):
+        found = {(folder / name).stat().st_ino for folder in folders}
+        assert len(found) == len({read_manifest(folder).files[name].sha256 for folder in folders})
+    assert (tiled_path / "encoder.onnx").stat().st_ino == (folders[0] / "encoder.onnx").stat().st_ino
+    assert len({(folder / "descriptors.npy").stat().st_ino for folder in folders}) == len(folders)
+    for square, folder in zip(sorted(squares), folders, strict=True):
+        for file in (file for file in folder.rglob("*") if file.is_file()):
+            assert file.read_bytes() == (squares[square] / file.relative_to(folder)).read_bytes()
+
+
+def test_an_intact_file_is_no_link_to_a_damaged_one(squares: dict[tuple[int, int], Path], tmp_path: Path) -> None:
+    """The encoder of the first tile is damaged, and its size is right. The other tiles keep theirs, which are links to one file."""
+    copies = {square: Path(shutil.copytree(path, tmp_path / path.name)) for square, path in squares.items()}
+    first, second, *_ = sorted(copies)
+    content = (copies[first] / "encoder.onnx").read_bytes()
+    (copies[first] / "encoder.onnx").write_bytes(content[:-1] + bytes([content[-1] ^ 1]))
+    tiles = write_tiled(tmp_path / "out", copies, TILE_M, name="stock").tiles
+    folder_of = {(tile.column, tile.row): tmp_path / "out" / tile.folder for tile in tiles}
+    assert (folder_of[first] / "encoder.onnx").read_bytes() != content
+    for square in sorted(copies)[1:]:
+        assert (folder_of[square] / "encoder.onnx").read_bytes() == content
+        assert (folder_of[square] / "encoder.onnx").samefile(folder_of[second] / "encoder.onnx")
+
+
 def test_tiles_that_do_not_fit_together_are_refused(
     squares: dict[tuple[int, int], Path], small_map: Path, tmp_path: Path
 ) -> None:
