@@ -240,7 +240,9 @@ def describe(manifest: Manifest) -> str:
         manifest: manifest of the bundle.
     """
     counts, recall = manifest.counts, manifest.parameters.get(inverted_file.RECALL)
+    finds = manifest.parameters.get(inverted_file.FINDS_TILE)
     search = "" if recall is None else f", search index with recall@10 of {recall:.3f} against exact search"
+    search += "" if finds is None else f" and the right tile among those that it chooses for {finds:.3f} of the queries"
     tiles = "" if manifest.tile_m is None else f", tiles of {manifest.tile_m:g} m: {len(manifest.tiles)}"
     return (
         f"map {manifest.name}, version {manifest.version}: {counts.places} places, {counts.views} views, "

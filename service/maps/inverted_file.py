@@ -26,6 +26,8 @@ FILE = "search.faiss"
 SMALLEST = 1_000_000
 #: Parameter of the manifest: recall@10 of the index against exact search, as measured when it was built.
 RECALL = "search_recall_at_10"
+#: Parameter of a tiled map: share of queries whose tile is among those that the index chooses, as measured when it was built.
+FINDS_TILE = "search_finds_tile"
 #: Number of principal axes. A map with fewer components has fewer.
 _AXES = 128
 #: The index omits a place with an odd number if its views are at least this similar to those of the place before or after it, as median
@@ -272,7 +274,7 @@ def _choose_probes(whole: Any, numbers: Rows, headings: int) -> float:
         numbers: descriptors of all views.
         headings: number of views per place.
     """
-    queries = _queries(numbers)
+    queries, _ = noisy_queries(numbers)
     tenth = _tenth_best(numbers, queries)
     inverted, opened = _faiss.downcast_index(whole.index), InvertedFile(whole, len(numbers), headings)
     # The lists that hold about the shortlist. With fewer, a search reads more of them anyway.
@@ -309,14 +311,21 @@ def recall_of(opened: Shortlister, numbers: Rows, queries: _QueryDescriptors, te
     return found / (best * len(queries))
 
 
-def _queries(numbers: Rows) -> _QueryDescriptors:
-    """Return views with the noise of two views of one place. Its spectrum is that of the map's own descriptors."""
+def noisy_queries(numbers: Rows) -> tuple[_QueryDescriptors, Int64[NDArray[np.int64], " q"]]:
+    """Return views with the noise of two views of one place, as queries, and the number of each one's own view.
+
+    The spectrum of the noise is that of the map's own descriptors.
+
+    Args:
+        numbers: 8-bit descriptors of all views.
+    """
     rng = np.random.default_rng(0)
     count = min(_QUERIES, len(numbers))
-    view, one, other = (vectors_of(numbers[np.sort(rng.integers(len(numbers), size=count))]) for _ in range(3))
+    own, *drawn = (np.sort(rng.integers(len(numbers), size=count)) for _ in range(3))
+    view, one, other = (vectors_of(numbers[each]) for each in (own, *drawn))
     noisy = view + _NOISE * (one - rng.permutation(other))
     queries: _QueryDescriptors = noisy / np.maximum(np.linalg.norm(noisy, axis=1, keepdims=True), 1e-12)
-    return queries
+    return queries, own
 
 
 def _tenth_best(numbers: Rows, queries: _QueryDescriptors) -> Float32[NDArray[np.float32], " q"]:

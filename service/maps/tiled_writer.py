@@ -13,11 +13,12 @@ from service.maps import content as parts
 from service.maps import index, inverted_file, manifest, streets
 from service.maps.calibration import Calibration, RigCorrection, Site, read_calibration
 from service.maps.files import json_object, read_file, require_files
+from service.maps.inverted_file import InvertedFile
 from service.maps.joined_index import JoinedRows
 from service.maps.manifest import TILES_FOLDER, Counts, FileEntry, Manifest, Tile, read_manifest
 from service.maps.reader import NEEDED, MapBundle
 from service.maps.streets import Streets
-from service.maps.tiles import MOST_SEARCHED, differences, places_in_map, street_numbers
+from service.maps.tiles import MOST_SEARCHED, differences, finds_tile, places_in_map, street_numbers
 from service.maps.writer import in_place, json_bytes, link_or_copy, sha256_of, sync
 
 #: Parameters of which the map states the largest of all tiles.
@@ -182,9 +183,7 @@ def _write_shared(
         names.append(inverted_file.FILE)
         arrays = [index.read_descriptors(bundle / index.FILE) for bundle in bundles]
         rows = JoinedRows([len(each) for each in arrays], arrays[0].shape[1], arrays.__getitem__)
-        parameters[inverted_file.RECALL] = inverted_file.write_inverted_file(
-            folder / inverted_file.FILE, rows, headings=first.headings
-        )
+        parameters |= _write_index(folder / inverted_file.FILE, rows, weights, first.headings)
     files = {
         each: FileEntry(sha256=sha256_of(folder / each), size=(folder / each).stat().st_size) for each in sorted(names)
     }
@@ -212,6 +211,22 @@ def _write_shared(
     (folder / manifest.FILE).write_bytes(made.to_bytes())
     sync(folder / manifest.FILE)
     return made
+
+
+def _write_index(path: Path, rows: JoinedRows, places: Sequence[int], headings: int) -> dict[str, float]:
+    """Write the search index of the map; return its recall, and the share of queries whose tile it chooses, as parameters.
+
+    Args:
+        path: the new file.
+        rows: descriptors of all tiles.
+        places: number of places of each tile.
+        headings: number of views per place.
+    """
+    recall = inverted_file.write_inverted_file(path, rows, headings=headings)
+    opened = InvertedFile.open(path, views=len(rows), dimension=rows.shape[1], headings=headings, verify=False)
+    queries, own_views = inverted_file.noisy_queries(rows)
+    finds = finds_tile(opened, queries, own_views, np.cumsum([0, *places]) * headings)
+    return {inverted_file.RECALL: recall, inverted_file.FINDS_TILE: float(finds.mean())}
 
 
 def _common(manifests: Sequence[Manifest]) -> set[str]:

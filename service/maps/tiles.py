@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
-from jaxtyping import Float32, Float64, Int32, Int64
+from jaxtyping import Bool, Float32, Float64, Int32, Int64
 from numpy.typing import NDArray
 
 from service.errors import BundleError, damaged_file
@@ -531,12 +531,10 @@ class TiledMap(Map):
             chosen = np.argsort(away_m, kind="stable")
             chosen = chosen[away_m[chosen] <= near[1]]  # the nearest first
         if len(chosen) > MOST_SEARCHED and self.search is not None:
-            views = self.search.most_similar(descriptor, min(LISTED, self.manifest.counts.views))
-            similar = in_order(
-                np.searchsorted(self.tiles.first_place, views // self.manifest.headings, side="right") - 1
-            )
+            first_view = self.tiles.first_place * self.manifest.headings
+            similar = chosen_tiles(self.search, descriptor, chosen, first_view)
             nearest = chosen[:1] if near is not None else chosen[:0]  # the tile at the prior is always searched
-            chosen = in_order(np.concatenate([nearest, similar[np.isin(similar, chosen)], chosen]))[:MOST_SEARCHED]
+            chosen = in_order(np.concatenate([nearest, similar]))[:MOST_SEARCHED]
         return self._region(chosen)
 
     def around(self, positions_of: Callable[[], Float64[NDArray[np.float64], "n 3"]]) -> Map:
@@ -582,6 +580,46 @@ class TiledMap(Map):
             cloud=self.tiles.cloud(numbers, opened),
             place_number=number,
         )
+
+
+def chosen_tiles(
+    search: PlaceSearch,
+    descriptor: Float32[NDArray[np.float32], " D"],
+    among: Int64[NDArray[np.int64], " n"],
+    first_view: Int64[NDArray[np.int64], " T"],
+) -> Int64[NDArray[np.int64], " m"]:
+    """Return the tiles to search for a query, at most ``MOST_SEARCHED``: those of the most similar views, then others in the given order.
+
+    Args:
+        search: of the whole map.
+        descriptor: descriptor of the query.
+        among: numbers of the tiles to choose from.
+        first_view: number of the first view of each tile, and the number of all views.
+    """
+    views = search.most_similar(descriptor, min(LISTED, int(first_view[-1])))
+    similar = in_order(np.searchsorted(first_view, views, side="right") - 1)
+    return in_order(np.concatenate([similar[np.isin(similar, among)], among]))[:MOST_SEARCHED]
+
+
+def finds_tile(
+    search: PlaceSearch,
+    descriptors: Float32[NDArray[np.float32], "q D"],
+    own_view: Int64[NDArray[np.int64], " q"],
+    first_view: Int64[NDArray[np.int64], " T"],
+) -> Bool[NDArray[np.bool_], " q"]:
+    """Return for each query without a prior whether the tile of its own view is searched.
+
+    Args:
+        search: of the whole map.
+        descriptors: descriptors of the queries.
+        own_view: number of the view in the map that shows what the query shows.
+        first_view: number of the first view of each tile, and the number of all views.
+    """
+    every, found = np.arange(len(first_view) - 1), np.zeros(len(descriptors), np.bool_)
+    owner = np.searchsorted(first_view, own_view, side="right") - 1
+    for number, descriptor in enumerate(descriptors):
+        found[number] = owner[number] in chosen_tiles(search, descriptor, every, first_view)
+    return found
 
 
 def in_order(numbers: Int64[NDArray[np.int64], " n"]) -> Int64[NDArray[np.int64], " m"]:

@@ -234,6 +234,15 @@ def test_a_survey_whose_places_differ_has_every_place_in_its_index(tmp_path: Pat
     assert len(opened.most_similar(unit_vectors(1, SIZE)[0], 800)) == held
 
 
+def test_a_noisy_query_resembles_its_own_view(written: SimpleNamespace) -> None:
+    """The noise is 0.6 times the difference of two views, so the cosine is about 1 / sqrt(1 + 2 x 0.6^2) = 0.76."""
+    queries, own = inverted_file.noisy_queries(written.numbers)
+    assert len(queries) == len(own) == 128
+    np.testing.assert_allclose(np.linalg.norm(queries, axis=1), 1, atol=1e-5)
+    similar = np.einsum("qd,qd->q", queries, vectors_of(written.numbers[own]))
+    assert np.median(similar) == pytest.approx(0.76, abs=0.05)
+
+
 def test_recall_counts_the_ten_best_views_that_are_listed(opened: InvertedFile, written: SimpleNamespace) -> None:
     """One query lists 7 of its 10 best views, the other all: 17 of 20."""
     stored = vectors_of(written.numbers)

@@ -6,17 +6,20 @@ import threading
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 
+from model_training.mapping.build import describe
 from model_training.mapping.calibration_file import renew_calibration
 from model_training.mapping.join import of_places
 from model_training.mapping.stored_map import content_of
 from model_training.stock import CALIBRATION
 from service.errors import BundleError
 from service.localization.localizer import Localizer
+from service.maps import inverted_file
 from service.maps import tiles as tiles_module
 from service.maps.calibration import Site, read_calibration
 from service.maps.manifest import read_manifest
@@ -190,6 +193,9 @@ def test_the_search_index_chooses_the_tiles_of_a_large_map(
         made[column, 0] = tmp_path / str(column)
     manifest = write_tiled(tmp_path / "row", made, TILE_M, name="row")
     assert "search.faiss" in manifest.files
+    assert manifest.parameters[inverted_file.FINDS_TILE] == 1.0  # random descriptors resemble only their own view
+    told = f"recall@10 of {manifest.parameters[inverted_file.RECALL]:.3f} against exact search and the right tile among"
+    assert f"{told} those that it chooses for 1.000 of the queries, tiles of 50 m: 9" in describe(manifest)
     opened = TiledMap.open(tmp_path / "row")
     for column in (0, 4, 8):
         part = opened.searched(vectors[column])
@@ -351,6 +357,29 @@ def test_the_nearest_square_of_a_position() -> None:
     xy = np.array([[10.0, 10.0], [60.0, 49.0], [-5.0, 200.0], [120.0, -7.0]])
     assert nearest_square(squares_m, xy).tolist() == [0, 1, 0, 1]
     assert in_order(np.array([3, 1, 3, 0, 1])).tolist() == [3, 1, 0]
+
+
+def listing(*lists: list[int]) -> Any:
+    """A search that returns these views, one list after the other."""
+    given = iter(lists)
+    return SimpleNamespace(shortlist=lambda *_: None, most_similar=lambda _descriptor, k: np.array(next(given))[:k])
+
+
+def test_the_tiles_of_the_most_similar_views_are_chosen_first() -> None:
+    """Ten tiles of ten views. The index lists views of tiles 7, 2 and 9. Tile 9 is not among the candidates, and others fill the rest."""
+    among = np.array([4, 2, 7, 0, 1, 3, 5])
+    search = listing([71, 20, 79, 99, 25])
+    chosen = tiles_module.chosen_tiles(search, np.zeros(3, np.float32), among, 10 * np.arange(11))
+    assert chosen.tolist() == [7, 2, 4, 0, 1, 3]
+
+
+def test_the_tile_of_a_query_is_found_if_it_is_one_of_the_first_six() -> None:
+    """Tiles of ten views. The first query has its tile 7 as the sixth of its list, the second as the seventh. The list of the third names
+    tile 9 only, so tiles 0 to 4 are searched too, and its own is 4."""
+    search = listing([0, 1, 10, 20, 30, 31, 40, 75], [0, 10, 20, 30, 40, 50, 75], [90])
+    own = np.array([71, 71, 49])
+    found = tiles_module.finds_tile(search, np.ones((3, 4), np.float32), own, 10 * np.arange(11))
+    assert found.tolist() == [True, False, True]
 
 
 def test_tiles_at_positions(tiled: TiledMap) -> None:
