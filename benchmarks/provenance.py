@@ -83,11 +83,9 @@ _CORE = (
 )
 _DATA = ("model_training/simulation", "model_training/datasets", "model_training/mapping", "model_training/evaluation")
 _ALL = ("streetfix", "service", "model_training", "native")
-#: Rows of real drives for which a calibration is made.
-_OF_CALIBRATED = (
-    "real.calibrated_on_0005.",
-    "real.ece_after_rig_calibration",
-    *(f"real.kitti_{drive}.ece_after_rig_calibration" for drive in ("0005", "0013")),
+_SEARCH = (
+    *("service/maps/index.py", "service/maps/inverted_file.py", "service/retrieval", "service/imaging"),
+    "model_training/stock/encoder.onnx",
 )
 #: Paths that the rows of each report measure, by the beginning of their ids. The longest match counts; "" matches all
 #: other rows. The benchmark programs are left out: a row is as old as the code that it measures.
@@ -116,10 +114,10 @@ MEASURED: dict[str, dict[str, tuple[str, ...]]] = {
         "ros2.": (*_CORE, "service/bridge"),
     },
     "scale": {
-        "": (
-            *("service/maps/index.py", "service/maps/inverted_file.py", "service/retrieval", "service/imaging"),
-            "model_training/stock/encoder.onnx",
-        )
+        "": _SEARCH,
+        "search.": (*_SEARCH, "service/maps/joined_index.py", "service/maps/tiles.py"),
+        "town.ready_s": (*_SEARCH, "service", "native"),
+        "town.resident_mib": (*_SEARCH, "service", "native"),
     },
     "serving": {
         "": ("service", "native"),

@@ -111,6 +111,7 @@ class Report:
         *,
         bar: float | None = None,
         better: Literal["higher", "lower"] = "higher",
+        why: str | None = None,
     ) -> None:
         """Add a row of a share with its Wilson interval.
 
@@ -119,12 +120,13 @@ class Report:
             right: outcome of each query (N,).
             bar: limit of the share; None for no bar.
             better: whether higher or lower values are better.
+            why: remark of the run itself.
         """
         if not len(right):
             self.row(row_id, None, "share", bar=bar, better=better, why="no query of this type")
             return
         interval = list(wilson_interval(int(right.sum()), len(right)))
-        self.row(row_id, float(right.mean()), "share", bar=bar, better=better, n=len(right), ci95=interval)
+        self.row(row_id, float(right.mean()), "share", bar=bar, better=better, n=len(right), ci95=interval, why=why)
 
     @contextmanager
     def made_by(self, run: Run) -> Iterator[None]:

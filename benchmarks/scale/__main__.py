@@ -1,6 +1,6 @@
 """``make bench-scale``: search in maps of up to a hundred towns, tiled maps, tiled builds, and object storage -> reports/scale.json.
 
-The first run simulates two small cities and builds their maps, whose descriptors it keeps. A hundred towns need 5 GB of memory and
+The first run simulates two small cities and builds their maps, whose descriptors it keeps. A hundred towns need 7 GB of memory and
 2 GB of disk. The part ``built`` kills builds and compares both engines. For the second row, install the extra ``ray``.
 """
 

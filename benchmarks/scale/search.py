@@ -1,5 +1,9 @@
-"""Search in drawn maps of several sizes: time, recall, bytes and build time of the scan and of the inverted file."""
+"""Search in drawn maps of several sizes: time, recall, bytes and build time of the scan and of the inverted file.
 
+``scan`` and ``index`` are the two searches of a map of one bundle. ``tiled`` is the search of a tiled map without a prior.
+"""
+
+import math
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -12,9 +16,11 @@ from numpy.typing import NDArray
 from benchmarks.report import Report
 from benchmarks.scale.drawn import Asked, DrawnViews
 from benchmarks.scale.sources import HEADINGS, RealDescriptors
+from benchmarks.scale.tiled import BEST, ROUNDS, TiledSearch, kept, tiled_search
+from benchmarks.scale.town import TILE_M, TOWN_M
 from service.maps.index import ScannedCopy, Shortlister, search_with_one_thread, vectors_of
 from service.maps.inverted_file import InvertedFile, write_inverted_file
-from service.maps.tiles import LISTED, MOST_SEARCHED, PlaceSearch, in_order
+from service.maps.tiles import MOST_SEARCHED, finds_tile
 from service.retrieval.knn import SHORTLIST
 
 #: Views of the town of 1 x 1 km and 20 km of streets, and of a hundred such towns.
@@ -27,17 +33,16 @@ BARRED = {
     "search.recall_at_10_at_100_times_the_town": "share",
     "search.bytes_per_view": "B",
 }
+#: Ratio of the times of tiled maps. The bar of the issue is that of ``search.ms_at_100_times_the_town``.
+SERVED = "search.served_ms_at_100_times_the_town"
 #: Queries, and views that an answer takes from a search by default.
 QUERIES, WANTED = 100, 240
-#: Views of a tile of 500 places.
-TILE_VIEWS = 500 * HEADINGS
-#: Best views that count for recall.
-BEST = 10
+#: Tiles of the town, and views of each of them.
+TOWN_TILES = round(TOWN_M[0] * TOWN_M[1] / TILE_M**2)
+TILE_VIEWS = HEADINGS * math.ceil(TOWN / HEADINGS / TOWN_TILES)
 #: Descriptors in memory that the exact comparison reads. The 12.5 GB of a hundred towns do not fit, so theirs are read at other places.
 KEPT = 4_000_000
 _CHUNK = 16_384
-#: Rounds over all queries. A time is the median over the queries of each one's least processor time.
-_ROUNDS = 3
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -57,6 +62,25 @@ class Ready:
     views: int
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class ReadyTiles:
+    """A tiled map that is ready to be searched.
+
+    Attributes:
+        row: name that its rows begin with.
+        numbers: descriptors of the map.
+        search: chooses the tiles; None if all are searched.
+        asked: queries.
+        tenth: similarity of each query's tenth best view by exact search.
+    """
+
+    row: str
+    numbers: DrawnViews
+    search: InvertedFile | None
+    asked: Asked
+    tenth: Float32[NDArray[np.float32], " Q"]
+
+
 def search_rows(report: Report, real: RealDescriptors, work: Path, sizes: tuple[int, ...] = SIZES) -> None:
     """Add the rows of every size, and the bars of a hundred towns.
 
@@ -69,16 +93,20 @@ def search_rows(report: Report, real: RealDescriptors, work: Path, sizes: tuple[
         sizes: numbers of views, ascending.
     """
     if TOWNS not in sizes:
-        for row_id, unit in BARRED.items():
+        for row_id, unit in {**BARRED, SERVED: "ratio"}.items():
             report.absent(row_id, unit, f"needs --sizes {TOWN} {TOWNS}")
     search_with_one_thread()
     ready: list[Ready] = []
+    tiled: list[ReadyTiles] = []
     paths = [work / f"{views}.faiss" for views in sizes]
     try:
         for views, path in zip(sizes, paths, strict=True):
-            ready += _built(report, DrawnViews(real, views), path)
+            searches, tiles = _built(report, DrawnViews(real, views), path)
+            ready, tiled = [*ready, *searches], [*tiled, *tiles]
             print(f"written: {report.write()}", flush=True)
-        times = _time_rows(report, ready, _kept(DrawnViews(real, min(max(sizes), KEPT))))
+        most = min(max(sizes), KEPT)
+        times = _time_rows(report, ready, kept(DrawnViews(real, most), 0, most))
+        times |= _tiled_rows(report, tiled)
     finally:
         for path in paths:
             path.unlink(missing_ok=True)
@@ -87,8 +115,8 @@ def search_rows(report: Report, real: RealDescriptors, work: Path, sizes: tuple[
     print(f"written: {report.write()}", flush=True)
 
 
-def _built(report: Report, numbers: DrawnViews, path: Path) -> list[Ready]:
-    """Build the searches of one size, add all rows but their times, and return them."""
+def _built(report: Report, numbers: DrawnViews, path: Path) -> tuple[list[Ready], list[ReadyTiles]]:
+    """Build the searches of one size, add all rows but their times, and return them. A map of one tile has no search of a tiled map."""
     views, row, ready = len(numbers), f"search.views_{len(numbers)}", []
     asked = numbers.queries(QUERIES)
     tenth, listed = tenth_best(numbers, asked), min(SHORTLIST * WANTED, views)
@@ -112,42 +140,56 @@ def _built(report: Report, numbers: DrawnViews, path: Path) -> list[Ready]:
     report.row(f"{row}.index_probes", opened.probes, "lists", n=opened.lists)
     recall = recall_at_10(opened, asked, tenth, numbers.__getitem__, listed)
     report.row(f"{row}.index_recall_at_10", recall, "share", n=QUERIES)
-    report.share(f"{row}.index_finds_tile", finds_tile(opened, asked, views))
+    first_view = np.append(np.arange(0, views, TILE_VIEWS), views)
+    tiles = len(first_view) - 1
+    finds = finds_tile(opened, asked.descriptors.mean(axis=1), asked.true_view, first_view)
+    report.share(f"{row}.index_finds_tile", finds, why=f"{_searched_of(tiles)}; {_tile_text()}")
     if views == TOWNS:
         report.row("search.recall_at_10_at_100_times_the_town", recall, "share", bar=0.99, n=QUERIES)
         report.row("search.bytes_per_view", bytes_per_view, "B", bar=40, better="lower", n=TOWNS)
-    return [*ready, Ready(f"{row}.index", opened, asked, views)]
+    searches = [*ready, Ready(f"{row}.index", opened, asked, views)]
+    # A tiled map of few tiles searches all of them.
+    chooses = opened if tiles > MOST_SEARCHED else None
+    return searches, [ReadyTiles(f"{row}.tiled", numbers, chooses, asked, tenth)] if tiles > 1 else []
 
 
-def finds_tile(opened: PlaceSearch, asked: Asked, views: int) -> NDArray[np.bool_]:
-    """Return for each query whether its tile is among those that a tiled map searches without a prior. The codes alone decide.
-
-    Args:
-        opened: the index.
-        asked: queries.
-        views: number of views of the map.
-    """
-    found = np.zeros(len(asked.descriptors), np.bool_)
-    for number, (turns, true) in enumerate(zip(asked.descriptors, asked.true_view, strict=True)):
-        similar = opened.most_similar(turns.mean(axis=0), min(LISTED, views))
-        found[number] = true // TILE_VIEWS in in_order(similar // TILE_VIEWS)[:MOST_SEARCHED]
-    return found
+def _searched_of(tiles: int) -> str:
+    """Return how many tiles of a map are searched without a prior."""
+    return f"all {tiles} tiles are searched" if tiles <= MOST_SEARCHED else f"{MOST_SEARCHED} of {tiles} tiles"
 
 
-def _kept(numbers: DrawnViews) -> Int8[NDArray[np.int8], "n D"]:
-    """Draw all views, some at a time, because drawing needs sixteen times the memory."""
-    kept = np.empty(numbers.shape, np.int8)
-    for first in range(0, len(numbers), _CHUNK):
-        kept[first : first + _CHUNK] = numbers[first : first + _CHUNK]
-    return kept
+def _tile_text() -> str:
+    """Return the size of a tile, and where it comes from."""
+    return f"a tile of {TILE_M:g} m has {TILE_VIEWS:,} views: the town has {TOWN:,} in {TOWN_TILES} tiles, {HEADINGS} for each place"
 
 
-def _time_rows(report: Report, ready: list[Ready], kept: Int8[NDArray[np.int8], "n D"]) -> dict[str, float]:
-    """Measure each search; add and return the times, ms. ``kept`` has the first views of the largest map, which all maps share."""
+def _tiled_rows(report: Report, ready: list[ReadyTiles]) -> dict[str, float]:
+    """Measure the search of each tiled map; add its rows and return the times, ms."""
+    times = {}
+    for each in ready:
+        found: TiledSearch = tiled_search(each.numbers, each.search, each.asked, each.tenth, TILE_VIEWS)
+        times[each.row] = found.ms
+        tiles = _searched_of(math.ceil(len(each.numbers) / TILE_VIEWS))
+        report.row(
+            f"{each.row}_ms",
+            found.ms,
+            "ms",
+            n=QUERIES,
+            why=f"{tiles}: {found.choose_ms:.1f} ms to choose them and put them together, {found.compare_ms:.1f} ms to scan and compare; "
+            f"{_tile_text()}",
+        )
+        why = f"of the ten best views of the whole map; {tiles}"
+        report.row(f"{each.row}_recall_at_10", found.recall, "share", n=QUERIES, why=why)
+        report.write()
+    return times
+
+
+def _time_rows(report: Report, ready: list[Ready], drawn: Int8[NDArray[np.int8], "n D"]) -> dict[str, float]:
+    """Measure each search; add and return the times, ms. ``drawn`` has the first views of the largest map, which all maps share."""
     times = {}
     for each in ready:
         listed = min(SHORTLIST * WANTED, each.views)
-        times[each.row] = search_ms(each.shortlister, each.asked, kept[: each.views], listed)
+        times[each.row] = search_ms(each.shortlister, each.asked, drawn[: each.views], listed)
         report.row(f"{each.row}_ms", times[each.row], "ms", n=QUERIES)
         report.write()
     return times
@@ -155,25 +197,40 @@ def _time_rows(report: Report, ready: list[Ready], kept: Int8[NDArray[np.int8], 
 
 def _ratio_rows(report: Report, times: dict[str, float]) -> None:
     """Add the times of a hundred towns over those of the town."""
-    towns, town = times[f"search.views_{TOWNS}.index"], times.get(f"search.views_{TOWN}.scan")
-    indexed = times.get(f"search.views_{TOWN}.index")
-    if town is None or indexed is None:
-        report.absent("search.ms_at_100_times_the_town", "ratio", f"needs the town too: --sizes {TOWN} {TOWNS}")
-        return
-    for row_id, one, bar, why in (
-        ("search.ms_at_100_times_the_town", town, 2, "the town is below the size of the index file, so it is scanned"),
+    of_all, of_one = (_searched_of(math.ceil(views / TILE_VIEWS)) for views in (TOWNS, TOWN))
+    ratios = (
+        (
+            "search.ms_at_100_times_the_town",
+            "index",
+            "scan",
+            2,
+            f"both as maps of one bundle: the town is below the size of the index file, so it is scanned. {SERVED} has tiled maps",
+        ),
         (
             "search.ms_at_100_times_the_indexed_town",
-            indexed,
+            "index",
+            "index",
             None,
             "with an index file, which `build-map` does not write",
         ),
-    ):
-        told = f"{towns:.2f} ms against {one:.2f} ms; {why}"
-        report.row(row_id, towns / one, "ratio", bar=bar, better="lower", n=QUERIES, why=told)
+        (
+            SERVED,
+            "tiled",
+            "tiled",
+            None,
+            f"both as tiled maps serve them without a prior: {of_all}, and in the town {of_one}",
+        ),
+    )
+    for row_id, of_towns, of_town, bar, why in ratios:
+        towns, town = times.get(f"search.views_{TOWNS}.{of_towns}"), times.get(f"search.views_{TOWN}.{of_town}")
+        if towns is None or town is None:
+            report.absent(row_id, "ratio", f"needs the town too: --sizes {TOWN} {TOWNS}")
+            continue
+        told = f"{towns:.2f} ms against {town:.2f} ms; {why}"
+        report.row(row_id, towns / town, "ratio", bar=bar, better="lower", n=QUERIES, why=told)
 
 
-def search_ms(shortlister: Shortlister, asked: Asked, kept: Int8[NDArray[np.int8], "n D"], listed: int) -> float:
+def search_ms(shortlister: Shortlister, asked: Asked, drawn: Int8[NDArray[np.int8], "n D"], listed: int) -> float:
     """Return the processor time of a search, ms: median over the queries.
 
     The steps are those of ``knn.search_views``: a shortlist by the mean of the turns, and an exact comparison with each turn.
@@ -181,15 +238,15 @@ def search_ms(shortlister: Shortlister, asked: Asked, kept: Int8[NDArray[np.int8
     Args:
         shortlister: makes the shortlist.
         asked: queries.
-        kept: descriptors to compare with. A view beyond them is read at another place, which takes as long.
+        drawn: descriptors to compare with. A view beyond them is read at another place, which takes as long.
         listed: length of the shortlist.
     """
-    took = np.full((_ROUNDS, len(asked.descriptors)), np.inf)
+    took = np.full((ROUNDS, len(asked.descriptors)), np.inf)
     for times in took:
         for number, turns in enumerate(asked.descriptors):
             began = time.thread_time()
             views = shortlister.shortlist(turns.mean(axis=0), listed)
-            best = (vectors_of(kept[views % len(kept)]) @ turns.T).max(axis=1)
+            best = (vectors_of(drawn[views % len(drawn)]) @ turns.T).max(axis=1)
             np.argsort(-best, kind="stable")[:WANTED]
             times[number] = time.thread_time() - began
     return float(1e3 * np.median(took.min(axis=0)))

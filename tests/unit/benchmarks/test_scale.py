@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from benchmarks.report import Report
-from benchmarks.scale import search, town
+from benchmarks.scale import search, tiled, town
 from benchmarks.scale.built import APART_M, copied
 from benchmarks.scale.drawn import Asked, DrawnViews, _step
 from benchmarks.scale.sources import HEADINGS, RealDescriptors
@@ -119,23 +119,77 @@ def test_the_time_of_a_search_is_that_of_one_query(real: RealDescriptors) -> Non
     assert calls == [100] * 3 * 4
 
 
-def test_a_tile_is_found_if_it_is_among_the_first_six_of_the_list(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Tiles of ten views. The first query has tile 7 as the sixth tile of its list, the second as the seventh."""
-    monkeypatch.setattr(search, "TILE_VIEWS", 10)
-    lists = iter([np.array([0, 1, 10, 20, 30, 31, 40, 75]), np.array([0, 10, 20, 30, 40, 50, 75])])
-    fake: Any = SimpleNamespace(most_similar=lambda _descriptor, _k: next(lists))
-    asked = Asked(np.ones((2, 3, SIZE), np.float32), np.array([71, 71]))
-    assert search.finds_tile(fake, asked, 100).tolist() == [True, False]
+def test_the_tile_size_is_that_of_the_town() -> None:
+    """489,000 views in a square kilometre, so in 4 tiles of 500 m: 20,375 places in tiles of 5,094 places (rounded up), 24 views each."""
+    assert search.TOWN_TILES == 4
+    assert search.TILE_VIEWS == 5094 * 24
+    assert -(-search.TOWN // search.TILE_VIEWS) == 4
+    assert -(-search.TOWNS // search.TILE_VIEWS) == 400
+
+
+def test_a_drawn_tile_has_the_views_of_its_range(real: RealDescriptors) -> None:
+    """1,500 views in tiles of 480: 480 = 20 places, 480, 480 and 60, whose third place has only 12 views."""
+    drawn = DrawnViews(real, 1500)
+    tiles = tiled.DrawnTiles(drawn, 480)
+    assert len(tiles) == 4
+    assert tiles.first_view.tolist() == [0, 480, 960, 1440, 1500]
+    assert tiles.first_place.tolist() == [0, 20, 40, 60, 63]
+    last = tiles.get(3)
+    assert (len(last.places), len(last.views)) == (3, 60)
+    assert last.views["place"].tolist() == [0] * 24 + [1] * 24 + [2] * 12
+    np.testing.assert_array_equal(last.view_index.rows[:], drawn[1440:])
+
+
+def test_few_drawn_tiles_stay_in_memory(real: RealDescriptors, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(tiled, "KEPT_TILES", 2)
+    tiles = tiled.DrawnTiles(DrawnViews(real, 1500), 480)
+    first = tiles.get(0)
+    tiles.get(1)
+    assert tiles.get(0) is first
+    tiles.get(2)  # forgets tile 1, the least recently used
+    assert tiles.get(0) is first
+    assert set(tiles._drawn) == {0, 2}
+
+
+def test_a_tiled_search_without_an_index_finds_all_best_views(real: RealDescriptors) -> None:
+    """Four tiles are all searched, and their shortlists have all 480 views each."""
+    drawn = DrawnViews(real, 1500)
+    asked = drawn.queries(4)
+    found = tiled.tiled_search(drawn, None, asked, search.tenth_best(drawn, asked), 480)
+    assert found.recall == 1.0
+    assert found.ms > 0
+
+
+def test_a_tiled_search_loses_the_best_views_of_other_tiles(real: RealDescriptors) -> None:
+    """Tiles of 48 views. The index names the six tiles of the first six best views, so at most the views in them are found."""
+    drawn = DrawnViews(real, 1440)
+    asked = drawn.queries(3)
+    similar = (vectors_of(drawn[:]) @ asked.descriptors.transpose(0, 2, 1)).max(axis=2)
+    best = np.argsort(-similar, axis=1)[:, :10]
+    named = [list(dict.fromkeys((views // 48).tolist()))[:6] for views in best]
+    # The first query gets tiles that have none of its best views, the others get those of their best views.
+    named[0] = [tile for tile in range(30) if tile not in set((best[0] // 48).tolist())][:6]
+    lists = {asked.descriptors[q].mean(axis=0).tobytes(): 48 * np.array(named[q]) for q in range(3)}
+
+    def most_similar(descriptor: np.ndarray, _k: int) -> np.ndarray:
+        return lists[descriptor.tobytes()]
+
+    fake: Any = SimpleNamespace(shortlist=lambda *_: None, most_similar=most_similar)
+    found = tiled.tiled_search(drawn, fake, asked, search.tenth_best(drawn, asked), 48)
+    expected = [np.isin(best[q] // 48, named[q]).sum() for q in range(3)]
+    assert expected[0] == 0
+    assert found.recall == pytest.approx(sum(expected) / 30)
 
 
 def test_all_sizes_are_built_and_then_timed(
     real: RealDescriptors, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A town of 2,880 views is scanned and has an index. Four towns have only an index."""
+    """A town of 2,880 views is scanned and has an index. Four towns have only an index. Tiles have 1,440 views."""
     monkeypatch.setattr(search, "TOWN", 2880)
     monkeypatch.setattr(search, "TOWNS", 11_520)
     monkeypatch.setattr(search, "MOST_SCANNED", 2880)
     monkeypatch.setattr(search, "KEPT", 5000)
+    monkeypatch.setattr(search, "TILE_VIEWS", 1440)
     report = Report("scale", "make bench-scale")
     monkeypatch.setattr(report, "write", lambda: None)
     search.search_rows(report, real, tmp_path, (2880, 11_520))
@@ -143,10 +197,19 @@ def test_all_sizes_are_built_and_then_timed(
     assert not list(tmp_path.iterdir())
     assert found["search.views_2880.scan_recall_at_10"] > 0.9
     assert found["search.views_11520.index_recall_at_10"] == found["search.recall_at_10_at_100_times_the_town"] > 0.9
-    assert found["search.views_11520.index_finds_tile"] == 1.0  # there are fewer than six tiles
+    assert found["search.views_2880.index_finds_tile"] == 1.0  # there are two tiles, so all are searched
+    assert 0.9 < found["search.views_11520.index_finds_tile"] <= 1.0
+    assert found["search.views_2880.tiled_recall_at_10"] > 0.9
+    assert found["search.views_11520.tiled_recall_at_10"] > 0.9
+    why = {row["id"]: row.get("why", "") for row in report.rows}
+    assert "all 2 tiles are searched" in why["search.views_2880.tiled_ms"]
+    assert "6 of 8 tiles" in why["search.views_11520.tiled_ms"]
+    assert "a tile of 500 m has 1,440 views" in why["search.views_11520.index_finds_tile"]
     assert "search.views_11520.scan_ms" not in found
     towns = found["search.views_11520.index_ms"]
     assert found["search.ms_at_100_times_the_town"] == towns / found["search.views_2880.scan_ms"]
+    served = found["search.views_11520.tiled_ms"] / found["search.views_2880.tiled_ms"]
+    assert found["search.served_ms_at_100_times_the_town"] == served
     assert found["search.ms_at_100_times_the_indexed_town"] == towns / found["search.views_2880.index_ms"]
 
 
@@ -166,6 +229,19 @@ def test_equal_files_of_a_tiled_map_count_once(tmp_path: Path) -> None:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(town, "read_manifest", by_folder.__getitem__)
         assert town.served_bytes(tmp_path, read) == 177
+
+
+def test_without_the_town_its_ratios_are_absent(
+    real: RealDescriptors, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A map of one tile has no search of a tiled map."""
+    report = Report("scale", "make bench-scale")
+    monkeypatch.setattr(report, "write", lambda: None)
+    search.search_rows(report, real, tmp_path, (1440,))
+    found = {row["id"]: row for row in report.rows}
+    assert found[search.SERVED]["value"] is None
+    assert found[search.SERVED]["why"] == "needs --sizes 489000 48900000"
+    assert not [row for row in found if ".tiled" in row]
 
 
 def test_copies_of_a_town_lie_apart_and_share_the_scans(small_dataset: Dataset, tmp_path: Path) -> None:
