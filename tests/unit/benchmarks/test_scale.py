@@ -254,3 +254,16 @@ def test_copies_of_a_town_lie_apart_and_share_the_scans(small_dataset: Dataset, 
     assert (np.diff(copied_stamps) > 0).all()
     np.testing.assert_array_equal(both.scan(len(poses)), one.scan(0))
     assert scan_path(both.folder, 0).stat().st_ino == scan_path(one.folder, 0).stat().st_ino
+
+
+def test_a_place_is_as_similar_as_its_best_view_at_the_best_turn():
+    vectors = np.array([[1, 0], [0, 1], [-1, 0], [0.6, 0.8]], np.float32)  # two views of each place
+    turns = np.array([[0, -1], [1, 0]], np.float32)
+    np.testing.assert_allclose(growth.place_similarity(vectors, turns, 2), [1.0, 0.6])
+
+
+def test_the_rank_of_the_right_place_counts_the_places_before_it():
+    similarity = np.array([0.9, 0.5, 0.7, 0.5], np.float32)
+    assert growth.rank_of_right(similarity, np.array([True, False, False, False])) == 0
+    assert growth.rank_of_right(similarity, np.array([False, True, False, True])) == 2
+    assert growth.rank_of_right(similarity, np.zeros(4, np.bool_)) == 4
