@@ -148,8 +148,10 @@ TILED_AND_STORED = (
     "service/maps/tiled_writer.py",
     "service/maps/tiles.py",
 )
-#: Files in the folders above that no row of a report runs: tiled maps, object storage, Qdrant, and commands for finished maps. A test
-#: checks that the benchmark loads none of them.
+#: The comparison of the stages of an answer with its ground truth.
+STAGES = "model_training/evaluation/stages.py"
+#: Files in the folders above that no row of a report runs: tiled maps, object storage, Qdrant, commands for finished maps, and the
+#: comparison of stages. A test checks that the benchmark loads none of them.
 NOT_RUN: dict[str, tuple[str, ...]] = {
     "accuracy": (
         *TILED_AND_STORED,
@@ -167,13 +169,18 @@ NOT_RUN: dict[str, tuple[str, ...]] = {
         "model_training/mapping/update.py",
         "model_training/mapping/update_tiled.py",
         "model_training/mapping/verify.py",
-    )
+        STAGES,
+    ),
+    **dict.fromkeys(("choices", "kitti", "paper"), (STAGES,)),
 }
-NOT_RUN["real_data"] = tuple(file for file in NOT_RUN["accuracy"] if file.startswith("model_training/"))
+NOT_RUN["real_data"] = tuple(
+    file for file in NOT_RUN["accuracy"] if file.startswith("model_training/") and file != STAGES
+)
 #: Files that only some rows of a report run, by the beginning of their ids.
 ONLY_RUN_BY: dict[str, dict[str, tuple[str, ...]]] = {
     "accuracy": {"service/localization/tracker.py": ("filter.",), "service/maps/inverted_file.py": ()},
     "real_data": {
+        STAGES: tuple(f"real.kitti_{drive}.{row}" for drive in ("0005", "0013") for row in ("inliers", "retrieval_at")),
         "service/localization/tracker.py": ("real.track.", "ros2."),
         "service/maps/inverted_file.py": (),
         **dict.fromkeys(TILED_AND_STORED, ("resume.", "ros2.")),  # these rows start commands in processes of their own

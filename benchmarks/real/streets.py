@@ -30,7 +30,7 @@ from model_training.evaluation.measures import recall_at
 from model_training.evaluation.odometry import as_query
 from model_training.evaluation.pose_errors import pose_errors
 from model_training.evaluation.predict import RANKED, Predictions, headings_of, predict
-from model_training.evaluation.stages import stages_of
+from model_training.evaluation.stages import QueryStages, stages_of
 from model_training.evaluation.tracks import followed, steps_of
 from model_training.importing.kinds import OpenSettings, open_recording
 from model_training.importing.take import TakeSettings, take
@@ -230,14 +230,36 @@ def _street(report: Report, data: Path, work: Path, name: str) -> Street | None:
 
 
 def _stage_rows(report: Report, street: Street) -> None:
-    """Add the recall of retrieval without registration, and the share of inliers at the true pose."""
-    found = stages_of(street.localizer, street.dataset, QUERIES)
-    at_truth = [each.inliers_at_truth for each in found if np.isfinite(each.inliers_at_truth)]
-    from_truth = [each.inliers_from_truth for each in found if np.isfinite(each.inliers_from_truth)]
-    bar = _INLIERS if street.name == "kitti_0013" else None
-    report.share(f"real.{street.name}.retrieval_at_1_5m", np.array([each.rank == 1 for each in found]))
-    report.row(f"real.{street.name}.inliers_at_truth", float(np.median(at_truth)), "share", bar=bar, n=len(at_truth))
-    report.row(f"real.{street.name}.inliers_from_truth", float(np.median(from_truth)), "share", n=len(from_truth))
+    """Add the recall of retrieval without registration, and shares of inliers at the true pose: measured, and by the noise model."""
+    inlier_rows(report, street.name, stages_of(street.localizer, street.dataset, QUERIES))
+
+
+def inlier_rows(report: Report, name: str, found: list[QueryStages]) -> None:
+    """Add the recall of retrieval alone, and medians of shares of inliers.
+
+    The medians are at the true pose (measured, and predicted by the noise model), and where registration from the true pose ends.
+
+    Args:
+        report: receives the rows.
+        name: name of the drive, part of the row ids.
+        found: comparison of each query with its ground truth.
+    """
+    report.share(f"real.{name}.retrieval_at_1_5m", np.array([each.rank == 1 for each in found], bool))
+    shares = {
+        "inliers_at_truth": [each.inliers_at_truth for each in found],
+        "inliers_predicted": [each.inliers_predicted for each in found],
+        "inliers_from_truth": [each.inliers_from_truth for each in found],
+    }
+    for row, every in shares.items():
+        known = [share for share in every if np.isfinite(share)]
+        report.row(
+            f"real.{name}.{row}",
+            float(np.median(known)) if known else None,
+            "share",
+            bar=_INLIERS if (name, row) == ("kitti_0013", "inliers_at_truth") else None,
+            n=len(known),
+            why=None if known else "no query has enough points to register",
+        )
 
 
 def prior_rows(report: Report, name: str, dataset: Dataset, localizer: Localizer) -> None:

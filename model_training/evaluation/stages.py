@@ -20,12 +20,12 @@ from service.localization.localizer import Localizer
 from service.localization.refine import settings_for_rig
 from service.maps.calibration import RIGHT_M
 from service.registration.kernel import STATE, QueryPoints
-from service.registration.points import blocks_of, points_from
 from service.registration.register import RegistrationSettings, Start, register, registered_of, score
 from service.registration.surfel_tiles import Cloud
 from service.retrieval.knn import distinct_places
 from service.retrieval.retrieve import RANKED, EncodedFrame
 from service.retrieval.starts import starts_from
+from service.scoring.measured import measure, merged_points
 
 #: Largest error of a right level. Registration starts from it and corrects about this much.
 TILT_DEG, HEIGHT_M = 3.0, 0.5
@@ -33,6 +33,12 @@ TILT_DEG, HEIGHT_M = 3.0, 0.5
 START_M, START_DEG = 4.0, 30.0
 #: Largest heading error of a right candidate, degrees.
 HEADING_DEG = 10.0
+
+#: Share of inliers that an exact noise model gives to points with a map surface in reach. A point counts by exp(-x^2 / 2), where x is its
+#: distance to the surface in standard deviations. The mean of this weight over the normal distribution is 1 / sqrt(2).
+EXACT_INLIERS = 1 / np.sqrt(2)
+#: Tolerance, metres, at which every point with a map surface in reach counts fully.
+_ANY_DISTANCE_M = 1e6
 
 #: Progress callback: stage, finished steps, all steps.
 Report = Callable[[str, int, int], None]
@@ -76,7 +82,9 @@ class QueryStages:
         start_m: distance of the nearest start with about the right heading.
         candidate_m: distance of the nearest registered pose with about the right heading.
         from_truth_m: distance between the true pose and the result of a registration that starts there.
-        inliers_at_truth: share of inliers at the true pose.
+        inliers_at_truth: share of inliers at the true pose, of the points that the service registers.
+        inliers_predicted: share of inliers that the noise model predicts there: ``EXACT_INLIERS`` of the points with a map surface in
+            reach. Points without one are no inliers at any pose.
         inliers_from_truth: share of inliers at the result of the registration from the true pose.
         error_m: distance of the answer from the true position, whatever its status.
         heading_error_deg: heading error of the answer, 0 to 180 degrees.
@@ -94,6 +102,7 @@ class QueryStages:
     candidate_m: float = np.inf
     from_truth_m: float = np.inf
     inliers_at_truth: float = np.nan
+    inliers_predicted: float = np.nan
     inliers_from_truth: float = np.nan
     error_m: float = np.inf
     heading_error_deg: float = np.nan
@@ -154,7 +163,7 @@ def _stages(localizer: Localizer, cloud: Cloud, asked: QueryFrame, truth: Transf
     retrieved = distinct_places(frame.matches, RANKED)
     away_m = [float(np.hypot(*(place.position_m[:2] - truth[:2, 3]))) for place in retrieved]
     near = [rank for rank, away in enumerate(away_m, 1) if away <= RIGHT_PLACE_M]
-    from_truth_m, at_truth, from_truth = _from_truth(localizer, cloud, frame, truth)
+    from_truth_m, at_truth, predicted, from_truth = _from_truth(localizer, cloud, frame, truth)
     found = QueryStages(
         number=asked.number,
         tilt_deg=tilt_deg,
@@ -164,6 +173,7 @@ def _stages(localizer: Localizer, cloud: Cloud, asked: QueryFrame, truth: Transf
         candidate_m=_nearest(_candidates(answer, frame), truth, heading, HEADING_DEG),
         from_truth_m=from_truth_m,
         inliers_at_truth=at_truth,
+        inliers_predicted=predicted,
         inliers_from_truth=from_truth,
         error_m=float(np.hypot(*(T_answer[:2, 3] - truth[:2, 3]))),
         heading_error_deg=abs(float(np.rad2deg(wrap_angle(heading_of_camera(T_answer) - heading)))),
@@ -229,28 +239,33 @@ def _nearest(poses: Iterator[tuple[Rotation, np.ndarray]], truth: Transform, hea
 
 def _from_truth(
     localizer: Localizer, cloud: Cloud, frame: EncodedFrame, truth: Transform
-) -> tuple[float, float, float]:
-    """Register from the true pose; return the distance that it moves (metres) and the share of inliers before and after."""
+) -> tuple[float, float, float, float]:
+    """Register the points of the service from the true pose.
+
+    Returns:
+        The distance that the pose moves (metres), and three shares of inliers: before, as the noise model predicts before, and after.
+    """
     settings = localizer.refining
     rig_px_m = frame.query.focal_baseline_px_m
     if rig_px_m is not None:
         settings = settings_for_rig(settings, rig_px_m)
-    blocks = blocks_of(frame.query.depth_m, frame.query.camera, settings.points, noise=frame.noise)
-    points = points_from(
-        blocks,
-        frame.R_level_camera,
-        frame.views.height_m,
+    measured = measure(
+        (frame,),
         settings.points,
-        noise=frame.noise,
         focal_baseline_px_m=settings.focal_baseline_px_m,
+        is_rig=rig_px_m is not None,
+        surveyed_height_m=localizer.bundle.manifest.surveyed_height_m,
     )
+    points = merged_points(measured)
     if len(points) < settings.fewest_points:
-        return np.inf, np.nan, np.nan
+        return np.inf, np.nan, np.nan, np.nan
     start = Start(frame.pose_of_level(truth)[:3, :3], truth[:3, 3], 0)
     best = register(cloud, points, [start], frame.views.height_m, settings.registration)[0]
     at_truth = _inliers(cloud, points, start, frame.views.height_m, settings.registration)
+    any_distance = replace(settings.registration, tolerance_m=_ANY_DISTANCE_M)
+    predicted = float(EXACT_INLIERS) * _inliers(cloud, points, start, frame.views.height_m, any_distance)
     T_map_camera = frame.pose_of_camera(best.T_map_level)
-    return float(np.hypot(*(T_map_camera[:2, 3] - truth[:2, 3]))), at_truth, best.inliers
+    return float(np.hypot(*(T_map_camera[:2, 3] - truth[:2, 3]))), at_truth, predicted, best.inliers
 
 
 def _inliers(cloud: Cloud, points: QueryPoints, at: Start, height_m: float, settings: RegistrationSettings) -> float:

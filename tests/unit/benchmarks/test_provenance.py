@@ -144,7 +144,8 @@ def test_every_report_says_what_its_rows_measure_and_that_is_there():
 
 @pytest.mark.parametrize("report", NOT_RUN)
 def test_a_benchmark_does_not_load_what_it_claims_not_to_run(report):
-    module = {"real_data": "real.__main__"}.get(report, report)
+    name = {"real_data": "real"}.get(report, report)
+    module = f"{name}.__main__" if (ROOT / "benchmarks" / name).is_dir() else name
     program = f"import sys, benchmarks.{module}; print(*(getattr(m, '__file__', None) for m in sys.modules.values()), sep='\\n')"
     done = subprocess.run([sys.executable, "-c", program], cwd=ROOT, capture_output=True, text=True, check=True)
     loaded = {Path(name) for name in done.stdout.splitlines()}
@@ -157,6 +158,14 @@ def test_a_benchmark_does_not_load_what_it_claims_not_to_run(report):
 def test_the_maps_of_accuracy_rows_have_no_search_index():
     """Their rows do not depend on the code of the index. With a smaller limit they would."""
     assert inverted_file.SMALLEST >= provenance.MOST_VIEWS
+
+
+def test_only_rows_of_single_stages_depend_on_their_code():
+    (rows,) = (each for file, each in provenance.ONLY_RUN_BY["real_data"].items() if file == provenance.STAGES)
+    told = json.loads((ROOT / "reports" / "real_data.json").read_text())
+    ids = {row["id"] for row in told["rows"] if row["id"].startswith(rows)}
+    names = ("retrieval_at_1_5m", "inliers_at_truth", "inliers_from_truth")
+    assert {f"real.kitti_{drive}.{name}" for drive in ("0005", "0013") for name in names} <= ids
 
 
 def test_the_longest_beginning_says_what_a_row_measures():

@@ -12,10 +12,11 @@ from benchmarks.real.confidence import (
     with_correction,
 )
 from benchmarks.real.peers import pooled_rows
-from benchmarks.real.streets import answer_rows, status_rows
+from benchmarks.real.streets import answer_rows, inlier_rows, status_rows
 from benchmarks.real.variants import EveryScan, grey
 from benchmarks.report import Report
 from model_training.datasets.dataset import Dataset
+from model_training.evaluation.stages import QueryStages
 from service.geometry.camera import PinholeCamera
 from service.localization.localizer import Localizer
 from service.maps.calibration import RigCorrection
@@ -80,6 +81,31 @@ def test_figures_of_a_variant_have_no_bar(tmp_path, answers_of):
     report = Report("x", "x", folder=tmp_path)
     answer_rows(report, "real.d.grey", answers_of([[0, 0]], [[4, 0]]), bars=False)
     assert not any("bar" in row for row in report.rows)
+
+
+def test_inliers_are_medians_beside_those_of_the_noise_model(tmp_path):
+    """A query without enough points has none and does not count. Only the held-out drive has a bar."""
+    report = Report("x", "x", folder=tmp_path)
+    shares = [(0.3, 0.5, 0.4), (0.5, 0.6, 0.6), (0.6, 0.7, 0.7), (np.nan, np.nan, np.nan)]
+    found = [
+        QueryStages(number=k, rank=k, inliers_at_truth=at, inliers_predicted=predicted, inliers_from_truth=ended)
+        for k, (at, predicted, ended) in enumerate(shares)
+    ]
+    inlier_rows(report, "kitti_0005", found)
+    inlier_rows(report, "kitti_0013", found)
+    rows = rows_of(report)
+    names = ("retrieval_at_1_5m", "inliers_at_truth", "inliers_predicted", "inliers_from_truth")
+    assert [rows[f"real.kitti_0005.{name}"]["value"] for name in names] == [0.25, 0.5, 0.6, 0.6]
+    assert [rows[f"real.kitti_0005.{name}"]["n"] for name in names] == [4, 3, 3, 3]
+    assert [row["id"] for row in report.rows if "bar" in row] == ["real.kitti_0013.inliers_at_truth"]
+    assert rows["real.kitti_0013.inliers_at_truth"]["holds"]
+
+
+def test_without_a_registered_query_no_share_of_inliers_is_claimed(tmp_path):
+    report = Report("x", "x", folder=tmp_path)
+    inlier_rows(report, "kitti_0013", [QueryStages(number=0)])
+    row = rows_of(report)["real.kitti_0013.inliers_at_truth"]
+    assert (row["value"], row["holds"], row["why"]) == (None, False, "no query has enough points to register")
 
 
 @pytest.mark.parametrize(("each", "first", "kept"), [(2, 0, [0, 2, 4]), (2, 1, [1, 3]), (3, 2, [2])])

@@ -8,8 +8,10 @@ import pytest
 from rich.console import Console
 
 from model_training.cli.stages_table import print_stages
+from model_training.evaluation import stages
 from model_training.evaluation.predict import predict
 from model_training.evaluation.stages import Lost, QueryStages, loses, lost_by_stage, stages_of
+from service.localization import refine
 from service.localization.localizer import Localizer
 from service.maps.reader import MapBundle
 
@@ -57,6 +59,55 @@ def test_stages_are_those_of_the_answers_that_evaluate_measures(small_map, small
     assert max(abs(each.height_error_m) for each in found) < 0.5
     assert np.median([each.from_truth_m for each in found]) < 0.5
     assert np.median([each.inliers_at_truth for each in found]) > 0.3
+
+
+def localizer_of(folder, **parameters):
+    bundle = MapBundle.open(folder)
+    manifest = bundle.manifest.model_copy(update={"parameters": bundle.manifest.parameters | parameters})
+    localizer = Localizer.open(bundle)
+    return Localizer(replace(bundle, manifest=manifest), localizer.encoder)
+
+
+def test_the_stages_register_the_points_that_the_service_registers(small_map, small_dataset, monkeypatch):
+    """The service omits points above the surveyed height (here 2 m). The row of inliers at the true pose once counted them."""
+    registered = {"service": [], "stages": []}
+    for name, module in (("service", refine), ("stages", stages)):
+
+        def recorded(cloud, points, *rest, name=name, register=module.register):
+            registered[name].append(points.xyz)
+            return register(cloud, points, *rest)
+
+        monkeypatch.setattr(module, "register", recorded)
+    found = {
+        high: stages_of(localizer_of(small_map, surveyed_height_m=high), small_dataset, NAME) for high in (2.0, 90.0)
+    }
+    assert len(registered["service"]) == len(registered["stages"]) == 10
+    for served, staged in zip(registered["service"], registered["stages"], strict=True):
+        np.testing.assert_array_equal(served, staged)
+    assert all(
+        len(low) < len(high) for low, high in zip(registered["stages"][:5], registered["stages"][5:], strict=True)
+    )
+    assert [each.inliers_at_truth for each in found[2.0]] != [each.inliers_at_truth for each in found[90.0]]
+
+
+def test_an_exact_noise_model_predicts_the_mean_weight_of_the_points_with_a_surface(
+    small_map, small_dataset, monkeypatch
+):
+    """Of the points 0.8 have a surface. The mean of exp(-x^2 / 2) over the normal distribution is 0.7071."""
+
+    def score(_cloud, _points, state, _height_m, settings):
+        state["inliers"] = 0.8 if settings.tolerance_m > 1000 else 0.3
+
+    monkeypatch.setattr(stages, "score", score)
+    found = stages_of(Localizer.open(MapBundle.open(small_map)), small_dataset, NAME)
+    assert {(each.inliers_at_truth, round(each.inliers_predicted, 4)) for each in found} == {(0.3, 0.5657)}
+
+
+def test_points_of_a_precise_camera_have_about_the_predicted_share_of_inliers(small_map, small_dataset):
+    found = stages_of(Localizer.open(MapBundle.open(small_map)), small_dataset, NAME)
+    predicted = [each.inliers_predicted for each in found]
+    assert max(predicted) <= stages.EXACT_INLIERS + 1e-9
+    assert np.median(predicted) > 0.4
 
 
 def test_numbers_that_are_not_finite_are_null_in_json():
