@@ -2,7 +2,7 @@
 
 import json
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
@@ -63,6 +63,7 @@ class Report:
     ) -> None:
         """Add a row; ``holds`` follows from value and bar.
 
+        A figure of no sample is no figure: with a bar, the row then has no value, and its bar does not hold.
         ``benchmarks/why_missed.py`` holds the reasons that people found later.
 
         Args:
@@ -86,11 +87,12 @@ class Report:
             entry |= {"bar": shown_bar, "better": "inside" if isinstance(bar, tuple) else better, "holds": holds}
         if why:
             entry["why"] = why
+        _drop_figures_of_nothing([entry])
         explain([entry])
         self.rows = [r for r in self.rows if r["id"] != row_id] + [entry]
         self._runs[row_id] = self._made_by
         mark = "" if bar is None else ("  holds" if entry["holds"] else "  MISSED")
-        shown = "-" if value is None else f"{value:.4f}"
+        shown = "-" if entry["value"] is None else f"{entry['value']:.4f}"
         print(f"{row_id:62} {shown:>10} {unit:8}{'' if bar is None else f' bar {bar}'}{mark}", flush=True)
 
     def absent(self, row_id: str, unit: str, why: str) -> None:
@@ -181,6 +183,7 @@ def write_report(path: Path, report: Mapping[str, Any]) -> Path:
         report: ``runs``, ``rows`` and ``notes``; the rows are changed in place.
     """
     rows, runs, head = report["rows"], report["runs"], head_commit()
+    _drop_figures_of_nothing(rows)
     explain(rows)
     mark_stale(path.stem, rows, runs, head)
     named = {row["run"] for row in rows}
@@ -194,6 +197,13 @@ def write_report(path: Path, report: Mapping[str, Any]) -> Path:
     part.write_text(json.dumps(told | ({"notes": report["notes"]} if report.get("notes") else {}), indent=1) + "\n")
     part.rename(path)
     return path
+
+
+def _drop_figures_of_nothing(rows: Iterable[dict[str, Any]]) -> None:
+    """Remove the value of each row that has a bar and no sample. Its bar does not hold, because nothing shows it."""
+    for row in rows:
+        if row.get("n") == 0 and "bar" in row and row["value"] is not None:
+            row |= {"value": None, "holds": False, "why": row.get("why", "there is no sample")}
 
 
 def _holds(value: float, bar: float | tuple[float, float], better: str) -> bool:

@@ -55,7 +55,9 @@ def _displaced_rows(report: Report, found: Tracks) -> None:
         bar=3,
         better="lower",
         n=len(noticed),
-        why=None if len(noticed) else "no robot was LOCALIZED before it was carried away",
+        why="the median; filter.kidnapped.noticed_within_3 is the share of robots within three frames"
+        if len(noticed)
+        else "no robot was LOCALIZED before it was carried away",
     )
     report.share("filter.kidnapped.noticed_within_3", noticed <= 3)
     report.share("filter.kidnapped.wrong_and_accepted", wrong[placed, BEFORE:].ravel(), better="lower")

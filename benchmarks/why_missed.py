@@ -466,3 +466,12 @@ _RIG_VALUES = {
     "rigs.zed2.within_1_m": 0.708,
 }
 WHY_MISSED |= {row: Reason(value, _RIGS[row.rsplit(".", maxsplit=1)[1]]) for row, value in _RIG_VALUES.items()}
+#: Families of which no answer is LOCALIZED.
+_NONE_LOCALIZED = (
+    "No answer of this family is LOCALIZED, so there is no share of them, and nothing shows that the bar holds. See "
+    "rigs.{family}.right_but_refused for what is refused"
+)
+WHY_MISSED |= {
+    f"rigs.{family}.wrong_of_localized": Reason(None, _NONE_LOCALIZED.format(family=family))
+    for family in ("iphone", "kinect", "rings", "zed2")
+}

@@ -94,17 +94,11 @@ def calibrated_elsewhere_rows(report: Report, learned_on: str, correction: RigCo
         found: answers with the correction; one at least.
     """
     row, right = f"real.calibrated_on_{learned_on}", position_errors(found) <= RIGHT_M
+    accepted = int(found.localized.sum())
+    wrong = float((found.localized & ~right).sum() / accepted) if accepted else None
     told = f"scale {correction.scale:.2f}, offset {correction.offset:+.2f}"
-    wrong = found.localized & ~right
-    report.row(
-        f"{row}.wrong_of_localized",
-        float(wrong.sum() / max(1, found.localized.sum())),
-        "share",
-        bar=_WRONG,
-        better="lower",
-        n=int(found.localized.sum()),
-        why=told,
-    )
+    told += "" if accepted else "; no LOCALIZED answer"
+    report.row(f"{row}.wrong_of_localized", wrong, "share", bar=_WRONG, better="lower", n=accepted, why=told)
     report.share(f"{row}.right_but_refused", right & ~found.localized, bar=_REFUSED, better="lower")
 
 

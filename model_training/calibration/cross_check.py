@@ -16,10 +16,13 @@ from service.option_limits import FALSE_ACCEPT_RATE
 class FamilyFigures:
     """Figures of a rig family, by a calibration without it. Shares refer to the queries in the map unless stated otherwise.
 
+    A share of nothing is NaN.
+
     Attributes:
         family: name of the family.
         inside: number of queries in the map.
         outside: number of out-of-map queries.
+        accepted: number of LOCALIZED answers, in the map and outside it.
         ece: expected calibration error over all queries.
         within_1_m: share of answers within 1 m, whatever their status.
         localized: share of LOCALIZED answers.
@@ -31,6 +34,7 @@ class FamilyFigures:
     family: str
     inside: int
     outside: int
+    accepted: int
     ece: float
     within_1_m: float
     localized: float
@@ -107,6 +111,7 @@ def figures_of(name: str, own: CalibrationData, calibration: Calibration, false_
         family=name,
         inside=int(inside.sum()),
         outside=int(outside.sum()),
+        accepted=int(localized.sum()),
         ece=expected_calibration_error(confidence, own.right),
         within_1_m=_share(own.right[inside]),
         localized=_share(localized[inside]),
@@ -154,7 +159,7 @@ def table(figures: list[FamilyFigures]) -> list[str]:
             each.wrong_of_localized,
             each.outside_accepted,
         )
-        columns = (f"{100 * share:>{width}.1f}" for share, width in zip(shares, _WIDTHS, strict=True))
+        columns = (f"{_percent(share):>{width}}" for share, width in zip(shares, _WIDTHS, strict=True))
         lines.append(f"{each.family:<14}{queries:>12}" + "".join(columns))
     return lines
 
@@ -165,4 +170,8 @@ _WIDTHS = (7, 12, 11, 16, 20, 18)
 
 
 def _share(events: NDArray[np.bool_]) -> float:
-    return float(events.mean()) if len(events) else 0.0
+    return float(events.mean()) if len(events) else float("nan")
+
+
+def _percent(share: float) -> str:
+    return "-" if np.isnan(share) else f"{100 * share:.1f}"

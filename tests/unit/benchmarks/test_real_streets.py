@@ -178,3 +178,12 @@ def test_rows_with_the_correction_of_another_drive(tmp_path, answers_of):
     assert (wrong["value"], wrong["n"], wrong["holds"]) == (pytest.approx(1 / 3), 3, False)
     assert (refused["value"], refused["n"], refused["holds"]) == (pytest.approx(0.2), 5, False)
     assert wrong["why"] == "scale 1.50, offset -0.50"
+
+
+def test_without_a_localized_answer_no_share_of_them_is_claimed(tmp_path, answers_of):
+    report = Report("x", "x", folder=tmp_path)
+    found = answers_of([[0, 0]], [[0.1, 0]], status=["AMBIGUOUS"])
+    calibrated_elsewhere_rows(report, "0005", CORRECTION, found)
+    row = rows_of(report)["real.calibrated_on_0005.wrong_of_localized"]
+    assert (row["value"], row["n"], row["holds"]) == (None, 0, False)
+    assert row["why"] == "scale 1.50, offset -0.50; no LOCALIZED answer"

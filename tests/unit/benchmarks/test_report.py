@@ -56,6 +56,25 @@ def test_a_share_of_no_query_is_none_and_its_bar_is_missed(report):
     assert "ci95" not in row
 
 
+def test_a_bar_does_not_hold_for_a_figure_of_nothing(report):
+    """Rows of rigs without a LOCALIZED answer once said that no LOCALIZED answer is wrong."""
+    report.row("a", 0.0, "share", bar=0.01, better="lower", n=0)
+    report.row("b", 0.0, "share", bar=0.01, better="lower", n=0, why="no LOCALIZED answer")
+    assert [(row["value"], row["holds"], row["why"]) for row in report.rows] == [
+        (None, False, "there is no sample"),
+        (None, False, "no LOCALIZED answer"),
+    ]
+    report.row("minutes", 0.0, "min", n=0)
+    assert row_of(report, "minutes")["value"] == 0.0
+
+
+def test_a_figure_of_nothing_of_an_earlier_run_loses_its_value_too(report):
+    kept = {"id": "a", "run": "r", "unit": "share", "value": 0.0, "n": 0, "bar": 0.9, "better": "lower", "holds": True}
+    module.write_report(module.REPORTS / "mine.json", {"runs": {"r": {"commit": "c", "date": None}}, "rows": [kept]})
+    (row,) = written()["rows"]
+    assert (row["value"], row["holds"], row["why"]) == (None, False, "there is no sample")
+
+
 def test_a_share_without_a_bar_neither_holds_nor_misses(report, capsys):
     report.share("a", np.ones(3, bool))
     assert not {"bar", "holds", "better"} & set(row_of(report, "a"))

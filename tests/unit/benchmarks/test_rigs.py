@@ -2,7 +2,9 @@ import numpy as np
 import pytest
 
 from benchmarks import rigs
+from benchmarks.full import gross_error_row
 from benchmarks.report import Report
+from model_training.calibration.cross_check import FamilyFigures
 from model_training.calibration.fit import CalibrationData, pooled
 from service.confidence.features import FEATURES
 
@@ -71,3 +73,36 @@ def test_the_worst_family_is_named(rows):
         rows[f"rigs.{name}.sigma_coverage_gap"]["value"] for name in ("car", "rings", "robot", "lorry")
     )
     assert rows[f"rigs.{gap['why']}.sigma_coverage_gap"]["value"] == gap["value"]
+
+
+def test_a_rig_without_a_localized_answer_has_no_share_of_wrong_ones(tmp_path):
+    """Its bar does not hold, because nothing shows it. A share of out-of-map queries needs such queries."""
+    report = Report("x", "x", folder=tmp_path)
+    none = float("nan")
+    rigs._figure_rows(report, "rigs.phone", FamilyFigures("phone", 500, 0, 0, 0.02, 0.08, 0.0, 0.08, none, none))
+    rows = {row["id"].removeprefix("rigs.phone."): row for row in report.rows}
+    wrong = rows["wrong_of_localized"]
+    assert (wrong["value"], wrong["n"], wrong["holds"], wrong["why"]) == (None, 0, False, "no LOCALIZED answer")
+    assert rows["right_but_refused"]["value"] == 0.08
+    assert "outside_accepted" not in rows
+
+
+def test_a_family_without_a_query_in_the_map_refuses_no_right_answer(tmp_path):
+    report = Report("x", "x", folder=tmp_path)
+    none = float("nan")
+    rigs._figure_rows(report, "rigs.lost", FamilyFigures("lost", 0, 40, 0, 0.0, none, none, none, none, 0.0))
+    row = next(row for row in report.rows if row["id"] == "rigs.lost.right_but_refused")
+    assert (row["value"], row["holds"], row["why"]) == (None, False, "no query in the map")
+
+
+def test_the_safe_default_has_a_bar_on_wrong_answers_of_the_accepted_ones(tmp_path):
+    """One of 100 LOCALIZED answers is more than 1 m off: the bar of 0.01 holds. With two it does not."""
+    for wrong, holds in ((1, True), (2, False)):
+        report = Report("x", "x", folder=tmp_path)
+        accepted = np.arange(150) < 100
+        gross_error_row(report, "stereo", accepted, accepted & (np.arange(150) >= wrong))
+        (row,) = report.rows
+        assert (row["id"], row["value"], row["n"]) == ("doubt.gross_errors.stereo", wrong / 100, 100)
+        assert row["holds"] is holds
+    gross_error_row(report, "precise", np.zeros(5, bool), np.zeros(5, bool))
+    assert report.rows[-1]["value"] is None

@@ -1,7 +1,14 @@
 import numpy as np
 import pytest
 
-from model_training.calibration.cross_check import FamilyFigures, accepted, cross_check, cross_check_groups, table
+from model_training.calibration.cross_check import (
+    FamilyFigures,
+    accepted,
+    cross_check,
+    cross_check_groups,
+    figures_of,
+    table,
+)
 from model_training.calibration.fit import CalibrationData, confidences, fit, pooled
 from service.confidence.features import FEATURES
 
@@ -86,8 +93,21 @@ def test_relatives_are_left_out_together():
 
 
 def test_the_table_has_the_worst_family_first():
-    rows = [FamilyFigures(name, 10, 20, ece, 0.9, 0.8, 0.1, 0.0, 0.05) for name, ece in (("good", 0.01), ("bad", 0.2))]
+    rows = [
+        FamilyFigures(name, 10, 20, 9, ece, 0.9, 0.8, 0.1, 0.0, 0.05) for name, ece in (("good", 0.01), ("bad", 0.2))
+    ]
     lines = table(rows)
     assert len(lines) == 4
     assert lines[2].split() == ["bad", "10+20", "20.0", "90.0", "80.0", "10.0", "0.0", "5.0"]
     assert lines[3].split()[0] == "good"
+
+
+def test_a_share_of_nothing_is_no_share():
+    """No answer reaches a confidence of 2, so none is LOCALIZED. The family has no out-of-map query either."""
+    data = family("one", 1)
+    calibration = fit(data, measured_on={})
+    thresholds = tuple(each.model_copy(update={"confidence": 2.0}) for each in calibration.thresholds)
+    found = figures_of("one", data.where(data.known), calibration.model_copy(update={"thresholds": thresholds}), 0.01)
+    assert (found.accepted, found.localized) == (0, 0.0)
+    assert np.isnan([found.wrong_of_localized, found.outside_accepted]).all()
+    assert table([found])[2].split()[-2:] == ["-", "-"]
