@@ -7,7 +7,7 @@ from typing import Any
 
 import matplotlib
 
-from benchmarks import decisions
+from benchmarks import decisions, fell
 from benchmarks.figures import write_figures
 from benchmarks.kitti.published import NOTE as PUBLISHED_NOTE
 from benchmarks.kitti.published import published_lines
@@ -42,7 +42,7 @@ def main() -> None:
 
 
 def _section(name: str, report: dict[str, Any]) -> list[str]:
-    """Return one report: its runs, rows, reasons and images."""
+    """Return one report: its runs, rows, reasons and images, and the rows of the accuracy report that fell."""
     rows, notes = report["rows"], report.get("notes", {})
     numbers = {key: number for number, key in enumerate(report["runs"], 1)}
     stale, same, unknown = (
@@ -90,6 +90,8 @@ def _section(name: str, report: dict[str, Any]) -> list[str]:
     if "accepts" in notes:
         picture = _accepts(name, notes["accepts"])
         lines += [f"![false accepts against true accepts, for each kind of stranger]({picture.name})", ""]
+    if name == fell.REPORT.stem:
+        lines += fell.lines(fell.fallen(fell.kept_values(), rows))
     return lines
 
 

@@ -5,7 +5,7 @@ from numpy.typing import NDArray
 
 from benchmarks.plans import SEQUENCE, repeating_plan
 from benchmarks.report import Report
-from benchmarks.runs import Runs, accepted_within
+from benchmarks.runs import Runs, accepted_within, within
 from model_training.evaluation.predict import Predictions, PriorOf, joined
 from model_training.simulation.repeating import landmarks_m
 
@@ -57,5 +57,6 @@ def sequence_rows(report: Report, runs: Runs) -> None:
     away = np.abs(x[:, None] - landmarks_m()).min(axis=1)
     passed, far = away <= PASSED_M, between_landmarks(found)
     report.share("sequence.landmark.within_1_m", accepted_within(found, 1.0)[passed], bar=0.99)
+    report.share("sequence.landmark.forced_within_1_m", within(found, 1.0)[passed])
     report.share("sequence.no_landmark.ambiguous", found.status[far] == "AMBIGUOUS", bar=0.95)
     report.share("sequence.no_landmark.wrong_and_accepted", (found.localized & ~accepted_within(found, 1.0))[far])
