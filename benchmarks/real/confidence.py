@@ -1,49 +1,76 @@
-"""Whether the confidence holds on real drives, before and after a calibration for their rig.
+"""Whether the confidence holds on real recordings, before and after a calibration for their rig.
 
-Each query is asked twice: in the map, and in the map without the places around it. So half of the weight lies on out-of-map
-queries. No real recording took part in the calibration. The calibration for the rig is cross-validated over blocks of
-consecutive frames. The correction of one drive is also applied to the other drive, which took no part in it.
+Each query of a drive is asked twice: in the map, and in the map without the places around it. The pooled rows add the queries that are
+asked on the other drive's map, and single stereo frames of the same car. Half of the weight lies on out-of-map queries. No real recording
+took part in the calibration, but drive 0005 helped to choose its features. The calibration for the rig is cross-validated over blocks of
+consecutive frames. The correction of one drive is also applied to queries that took no part in it.
 """
 
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from benchmarks.report import Report
 from model_training.calibration.own_drive import frames_of_drive
-from model_training.calibration.own_rig import learn_correction
+from model_training.calibration.own_rig import calibration_error, learn_correction, log_odds_of, validated, weights_of
 from model_training.datasets.dataset import Dataset
 from model_training.evaluation.failures import position_errors
 from model_training.evaluation.predict import Predictions
 from service.errors import BundleError
 from service.localization.localizer import Localizer
-from service.maps.calibration import RIGHT_M, RigCorrection
+from service.maps.calibration import RIGHT_M, RigCorrection, corrected_log_odds, probability
 
 #: Bars of issue 38 (docs/decisions): calibration error without and with a calibration for the rig. With the correction of another drive:
 #: wrong answers of the accepted ones, and right answers that are refused, of all queries.
 _ECE, _AFTER, _WRONG, _REFUSED = 0.10, 0.05, 0.02, 0.05
 
 
-@dataclass(frozen=True)
-class CalibrationErrors:
-    """Calibration errors of a drive.
+#: Said beside the pooled rows.
+_JUDGED_ON = "no real query was fitted, but drive 0005 helped to choose the features (decisions 0137 and 0165)"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class JudgedQueries:
+    """Confidence and correctness of some real queries.
 
     Attributes:
-        frames: number of queries, in the map and outside it.
-        before: expected calibration error of the map's calibration.
-        after: the same with the correction for the rig, cross-validated.
-        correction: the correction that all queries together give.
+        name: what the queries are.
+        outside: whether each is an out-of-map query (n,).
+        right: whether each answer is right (n,). Out-of-map queries have no right answer.
+        before: confidence by the map's calibration (n,); 0 without registration.
+        after: the same with a correction for the rig in whose fit the query took no part (n,).
     """
 
-    frames: int
-    before: float
-    after: float
+    name: str
+    outside: NDArray[np.bool_]
+    right: NDArray[np.bool_]
+    before: NDArray[np.float64]
+    after: NDArray[np.float64]
+
+    def error(self, confidence: NDArray[np.float64]) -> float:
+        """Return the expected calibration error; half of the weight lies on the out-of-map queries.
+
+        Args:
+            confidence: ``before`` or ``after``.
+        """
+        return calibration_error(confidence, self.right, weights_of(self.outside))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class DriveConfidence:
+    """Confidence of the queries of a drive.
+
+    Attributes:
+        judged: the queries, in the map and outside it.
+        correction: the correction for the rig that all of them together give.
+    """
+
+    judged: JudgedQueries
     correction: RigCorrection
 
 
-def confidence_rows(
-    report: Report, name: str, dataset: Dataset, localizer: Localizer, queries: str
-) -> CalibrationErrors:
+def confidence_rows(report: Report, name: str, dataset: Dataset, localizer: Localizer, queries: str) -> DriveConfidence:
     """Add the calibration errors of a drive.
 
     Args:
@@ -61,10 +88,30 @@ def confidence_rows(
         raise BundleError(f"{localizer.bundle.path}: the map has no calibration, so there is no confidence to measure")
     found = frames_of_drive(localizer, dataset, [queries], odometry_noise=0.0)
     learned = learn_correction(calibration, found.frames, source="drive", measured_on=found.described)
-    errors = CalibrationErrors(len(found.frames), learned.error_before, learned.error_after, learned)
-    report.row(f"real.{name}.ece", errors.before, "share", better="lower", n=errors.frames)
-    report.row(f"real.{name}.ece_after_rig_calibration", errors.after, "share", better="lower", n=errors.frames)
-    return errors
+    each = validated(calibration, found.frames, source="drive")
+    judged = JudgedQueries(name, found.frames.outside, found.frames.right, each.before, each.after)
+    for row, value in (("ece", learned.error_before), ("ece_after_rig_calibration", learned.error_after)):
+        report.row(f"real.{name}.{row}", value, "share", better="lower", n=len(found.frames))
+    return DriveConfidence(judged, learned)
+
+
+def judged_answers(name: str, found: Predictions, correction: RigCorrection, *, outside: bool) -> JudgedQueries:
+    """Return the confidence of answers, also with the correction of queries that these are not.
+
+    Args:
+        name: what the queries are.
+        found: answers of a map without a correction.
+        correction: correction for the same rig, from other queries.
+        outside: whether all of them are out-of-map queries. Else their answers are right within ``RIGHT_M``.
+    """
+    before = np.nan_to_num(found.confidence)
+    after, known = before.copy(), (before > 0) & (before < 1)
+    odds = corrected_log_odds(
+        log_odds_of(before[known]), correction.scale, correction.offset, lower_only=correction.lower_only
+    )
+    after[known] = probability(odds)
+    right = (position_errors(found) <= RIGHT_M) & (not outside)
+    return JudgedQueries(name, np.full(len(before), outside), right, before, after)
 
 
 def with_correction(localizer: Localizer, correction: RigCorrection) -> Localizer:
@@ -102,18 +149,21 @@ def calibrated_elsewhere_rows(report: Report, learned_on: str, correction: RigCo
     report.share(f"{row}.right_but_refused", right & ~found.localized, bar=_REFUSED, better="lower")
 
 
-def pooled_confidence_rows(report: Report, drives: list[CalibrationErrors]) -> None:
-    """Add the calibration errors over all drives, weighted by their numbers of queries.
+def pooled_confidence_rows(report: Report, parts: list[JudgedQueries]) -> None:
+    """Add the calibration errors over all real queries, in maps and outside them, without and with a correction for the rig.
 
     Args:
         report: receives the rows.
-        drives: calibration errors of each drive.
+        parts: the queries of each recording.
     """
-    if not drives:
+    if not parts:
         return
-    weights, count = [each.frames for each in drives], sum(each.frames for each in drives)
-    before, after = (
-        np.average([getattr(each, name) for each in drives], weights=weights) for name in ("before", "after")
+    outside, right, before, after = (
+        np.concatenate([getattr(each, name) for each in parts]) for name in ("outside", "right", "before", "after")
     )
-    report.row("real.ece", float(before), "share", bar=_ECE, better="lower", n=count)
-    report.row("real.ece_after_rig_calibration", float(after), "share", bar=_AFTER, better="lower", n=count)
+    every = JudgedQueries("all", outside, right, before, after)
+    counts = ", ".join(f"{each.name} {(~each.outside).sum()} and {each.outside.sum()}" for each in parts)
+    told = f"{(~outside).sum()} queries in the map and {outside.sum()} outside it: {counts}; {_JUDGED_ON}"
+    for row, confidence, bar in (("ece", before, _ECE), ("ece_after_rig_calibration", after, _AFTER)):
+        value = every.error(confidence)
+        report.row(f"real.{row}", value, "share", bar=bar, better="lower", n=len(right), why=told)

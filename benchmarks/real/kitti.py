@@ -7,11 +7,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.real.served import away_m, served
+from benchmarks.real.stereo_frames import LIDAR_HEIGHT_M, QUERIES, stereo_frames
 from benchmarks.real.streets import status_rows
 from benchmarks.report import Report
 from model_training.datasets.dataset import Dataset, read_tum
 from model_training.importing.kinds import OpenSettings, open_recording
-from model_training.importing.kitti_object import import_kitti_object
 from model_training.importing.pose_file import read_pose_file
 from model_training.importing.take import TakeSettings, take
 from model_training.importing.trajectory import Trajectory
@@ -22,7 +22,6 @@ from model_training.stock import ENCODER
 from service.geometry.rigid import transform_from
 
 DRIVE = Path("2011_09_26") / "2011_09_26_drive_sync"
-LIDAR_HEIGHT_M = 1.73  # from KITTI's drawing of its vehicle
 SETTINGS = OpenSettings(depth="lidar")
 NOT_HELD_OUT = "not held out: the traffic vote was chosen on these frames"
 NO_DATA = "no recordings at {name}"
@@ -71,17 +70,13 @@ def stereo_rows(report: Report, data: Path, work: Path) -> None:
         data: folder of the recordings.
         work: folder of datasets and maps.
     """
-    source = data / "kitti_stereo"
-    if not source.exists():
+    found = stereo_frames(data, work)
+    if found is None:
         report.row("real.kitti_stereo.answered_within_1_m", None, "share", bar=1.0, why=NO_DATA.format(name=data.name))
         return
-    folder, bundle = work / "kitti_stereo", work / "kitti_stereo_map"
-    _fresh(folder, bundle)
-    import_kitti_object(source, folder, depth="sgbm")
-    dataset = Dataset(folder)
-    build_map(dataset, ENCODER, bundle, BuildSettings(name="kitti-stereo", expected_lidar_height_m=LIDAR_HEIGHT_M))
-    truth = np.array([frame.T_map_camera for frame in dataset.queries("frames")])
-    answered = served(bundle, dataset, "frames")
+    dataset, bundle = found
+    truth = np.array([frame.T_map_camera for frame in dataset.queries(QUERIES)])
+    answered = served(bundle, dataset, QUERIES)
     away = away_m(answered.T_map_camera, truth)
     status_rows(report, "real.kitti_stereo", away, answered.localized, bars=(1.0, None, None))
 

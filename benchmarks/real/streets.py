@@ -17,11 +17,15 @@ from benchmarks.coverage import coverage_rows
 from benchmarks.real.confidence import (
     calibrated_elsewhere_rows,
     confidence_rows,
+    judged_answers,
     pooled_confidence_rows,
     with_correction,
 )
 from benchmarks.real.paper_network import paper_network
 from benchmarks.real.peers import peer_rows, pooled_rows
+from benchmarks.real.stereo_frames import NAME as STEREO
+from benchmarks.real.stereo_frames import QUERIES as STEREO_QUERIES
+from benchmarks.real.stereo_frames import stereo_frames
 from benchmarks.report import Report
 from benchmarks.runs import prior_with_std
 from model_training.datasets.dataset import Dataset
@@ -68,7 +72,9 @@ class Street:
 
 
 def street_rows(report: Report, data: Path, work: Path, drives: tuple[str, ...] = DRIVES) -> None:
-    """Add the rows of each drive on its own map, and the accepted share of its queries on the other map (out-of-map queries).
+    """Add the rows of each drive on its own map, and those of its queries on the other map (out-of-map queries).
+
+    The rows ``real.ece*`` pool all real queries, with the seven frames of ``kitti_stereo``.
 
     Args:
         report: receives the rows.
@@ -92,19 +98,28 @@ def street_rows(report: Report, data: Path, work: Path, drives: tuple[str, ...] 
             prior_rows(report, street.name, street.dataset, street.localizer)
             sequence_rows(report, street.name, street.dataset, street.localizer)
     pooled_rows(report, others)
-    pooled_confidence_rows(report, calibrated)
     if [street.name for street in streets] == list(DRIVES):
         correction, other = calibrated[0].correction, streets[1]
         answers = predict(with_correction(other.localizer, correction), other.dataset, QUERIES)
         calibrated_elsewhere_rows(report, streets[0].name.removeprefix("kitti_"), correction, answers)
-    accepted = [
-        predict(own.localizer, other.dataset, QUERIES).localized
-        for own in streets
+    judged = [each.judged for each in calibrated]
+    strangers = [
+        (own, other, predict(own.localizer, other.dataset, QUERIES), each.correction)
+        for own, each in zip(streets, calibrated, strict=True)
         for other in streets
         if own is not other
     ]
-    if accepted:
-        report.share("real.strangers.accepted", np.concatenate(accepted), bar=_WRONG, better="lower")
+    for own, other, answers, correction in strangers:
+        judged.append(judged_answers(f"{other.name} on the map of {own.name}", answers, correction, outside=True))
+    if strangers:
+        accepted = np.concatenate([answers.localized for _, _, answers, _ in strangers])
+        report.share("real.strangers.accepted", accepted, bar=_WRONG, better="lower")
+    frames = stereo_frames(data, work)
+    if frames is not None:
+        dataset, bundle = frames
+        answers = predict(Localizer.open(MapBundle.open(bundle)), dataset, STEREO_QUERIES)
+        judged.append(judged_answers(STEREO, answers, calibrated[0].correction, outside=False))
+    pooled_confidence_rows(report, judged)
 
 
 def answer_rows(report: Report, row: str, found: Predictions, *, bars: bool = True) -> None:

@@ -100,18 +100,14 @@ def learn_correction(
             f"{measured_on}: no frame in the map could be registered and labelled; give images from the map, with poses in its frame",
             field="queries",
         )
-    stock = calibration.model_copy(update={"rig": None})
-    before = np.asarray(stock.confidence(frames.evidence))
-    odds, weight = log_odds_of(before), weights_of(frames.outside)
-    lower_only = source == "rendered" or not frames.outside.any()
-    after = _cross_validated(odds, frames, lower_only, label_noise)
-    if not lower_only and not _keeps_rates(stock, before[frames.outside], after[frames.outside]):
-        lower_only = True
-        after = _cross_validated(odds, frames, lower_only, label_noise)
-    if _log_loss(after, frames.right, weight, label_noise) < _log_loss(before, frames.right, weight, label_noise):
-        scale, offset = fit_correction(odds, frames.right, weight, lower_only=lower_only, label_noise=label_noise)
-    else:
-        (scale, offset), after = (1.0, 0.0), before
+    stock, weight = calibration.model_copy(update={"rig": None}), weights_of(frames.outside)
+    found = validated(calibration, frames, source=source, label_noise=label_noise)
+    lower_only, before, after = found.lower_only, found.before, found.after
+    scale, offset = 1.0, 0.0
+    if found.improves:
+        scale, offset = fit_correction(
+            log_odds_of(before), frames.right, weight, lower_only=lower_only, label_noise=label_noise
+        )
     acceptable = [is_acceptable(stock, row, FALSE_ACCEPT_RATE) for row in frames.evidence]
     accepted = (after >= stock.threshold(FALSE_ACCEPT_RATE)) & np.array(acceptable)
     counts = [int(each.sum()) for each in (accepted & inside, accepted & inside & ~frames.right, accepted & ~inside)]
@@ -132,6 +128,52 @@ def learn_correction(
         outside_accepted=counts[2],
         outside_share_upper=upper_bound(counts[2], int(frames.outside.sum())),
     )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Validated:
+    """Confidence of labelled frames, without a correction and with one that was fitted on other blocks.
+
+    Attributes:
+        before: confidence by the calibration of the map (n,).
+        after: confidence by corrections that were fitted on the other blocks (n,). It equals ``before`` if they do not improve it.
+        lower_only: whether the corrections may only lower the confidence.
+        improves: whether the corrections improve the log loss.
+    """
+
+    before: NDArray[np.float64]
+    after: NDArray[np.float64]
+    lower_only: bool
+    improves: bool
+
+
+def validated(
+    calibration: Calibration,
+    frames: LabelledFrames,
+    *,
+    source: Literal["drive", "rendered"],
+    label_noise: float = 0.0,
+) -> Validated:
+    """Cross-validate the correction over blocks of consecutive frames.
+
+    Args:
+        calibration: calibration of the map. Its earlier correction for a rig does not count.
+        frames: the labelled frames, some of them in the map.
+        source: origin of the frames.
+        label_noise: share of wrong labels.
+    """
+    stock = calibration.model_copy(update={"rig": None})
+    before = np.asarray(stock.confidence(frames.evidence))
+    odds, weight = log_odds_of(before), weights_of(frames.outside)
+    lower_only = source == "rendered" or not frames.outside.any()
+    after = _cross_validated(odds, frames, lower_only, label_noise)
+    if not lower_only and not _keeps_rates(stock, before[frames.outside], after[frames.outside]):
+        lower_only = True
+        after = _cross_validated(odds, frames, lower_only, label_noise)
+    improves = _log_loss(after, frames.right, weight, label_noise) < _log_loss(
+        before, frames.right, weight, label_noise
+    )
+    return Validated(before, after if improves else before, lower_only, improves)
 
 
 def log_odds_of(confidence: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -1,13 +1,19 @@
 """Rows of real drives: figures by status, and forced figures."""
 
+from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
+from benchmarks.real import streets
 from benchmarks.real.confidence import (
-    CalibrationErrors,
+    DriveConfidence,
+    JudgedQueries,
     calibrated_elsewhere_rows,
+    confidence_rows,
+    judged_answers,
     pooled_confidence_rows,
     with_correction,
 )
@@ -15,6 +21,7 @@ from benchmarks.real.peers import pooled_rows
 from benchmarks.real.streets import answer_rows, inlier_rows, status_rows
 from benchmarks.real.variants import EveryScan, grey
 from benchmarks.report import Report
+from model_training.calibration import elsewhere
 from model_training.datasets.dataset import Dataset
 from model_training.evaluation.stages import QueryStages
 from service.geometry.camera import PinholeCamera
@@ -138,16 +145,63 @@ def test_drives_are_pooled_by_their_queries_and_ours_must_be_higher(tmp_path):
     assert rows_of(report)["real.peers.ours_within_1_m"]["holds"] is True
 
 
-def test_calibration_errors_are_pooled_by_the_queries_of_each_drive(tmp_path):
+def judged(name, *, inside, outside):
+    """Queries as (confidence, right) in the map, and confidences outside it. A correction halves each confidence."""
+    before = np.array([confidence for confidence, _ in inside] + outside)
+    right = np.array([is_right for _, is_right in inside] + [False] * len(outside), bool)
+    return JudgedQueries(name, np.arange(len(before)) >= len(inside), right, before, before / 2)
+
+
+def test_calibration_errors_are_those_of_all_queries_together(tmp_path):
+    """One bin: half of the weight on three queries in the map (mean confidence 0.9, all right), half on six outside it (0.5).
+
+    The mean confidence is 0.7 and half of the weight is right, so the error is 0.2. Halved, the mean is 0.35 and the error 0.15.
+    """
     report = Report("x", "x", folder=tmp_path)
-    pooled_confidence_rows(
-        report, [CalibrationErrors(10, 0.2, 0.1, CORRECTION), CalibrationErrors(30, 0.04, 0.02, CORRECTION)]
-    )
+    drive = judged("kitti_0005", inside=[(0.9, True), (0.9, True)], outside=[0.5, 0.5])
+    strangers = judged("kitti_0013 on the map of kitti_0005", inside=[], outside=[0.5] * 4)
+    stereo = judged("kitti_stereo", inside=[(0.9, True)], outside=[])
+    pooled_confidence_rows(report, [drive, strangers, stereo])
     rows = rows_of(report)
-    assert rows["real.ece"]["value"] == pytest.approx(0.08)
-    assert rows["real.ece"]["n"] == 40
-    assert rows["real.ece_after_rig_calibration"]["value"] == pytest.approx(0.04)
-    assert [row["holds"] for row in rows.values()] == [True, True]
+    assert rows["real.ece"]["value"] == pytest.approx(0.2)
+    assert rows["real.ece"]["n"] == 9
+    assert rows["real.ece_after_rig_calibration"]["value"] == pytest.approx(0.15)
+    assert [row["holds"] for row in rows.values()] == [False, False]
+    assert rows["real.ece"]["why"].startswith(
+        "3 queries in the map and 6 outside it: kitti_0005 2 and 2, kitti_0013 on the map of kitti_0005 0 and 4, kitti_stereo 1 and 0; "
+    )
+    assert "drive 0005 helped to choose the features" in rows["real.ece"]["why"]
+
+
+def test_the_bins_of_pooled_queries_follow_from_their_number(tmp_path):
+    """Forty queries have two bins of equal weight. Outside the map the confidence is 0. In it, it is 0.75, and all are right."""
+    report = Report("x", "x", folder=tmp_path)
+    pooled_confidence_rows(report, [judged("d", inside=[(0.75, True)] * 4, outside=[0.0] * 36)])
+    assert rows_of(report)["real.ece"]["value"] == pytest.approx(0.5 * 0.25)
+
+
+def test_answers_outside_the_map_are_wrong_and_have_the_correction_of_others(answers_of):
+    """Log odds of 0.5 are 0, and the corrected ones -0.5: a confidence of 0.3775. An answer without registration has a confidence of 0."""
+    near, far = [[0, 0], [0, 0], [0, 0]], [[0.1, 0], [3, 0], [0.2, 0]]
+    found = replace(answers_of(near, far), confidence=np.array([0.5, 0.5, np.nan]))
+    inside = judged_answers("a", found, CORRECTION, outside=False)
+    assert inside.right.tolist() == [True, False, True]
+    np.testing.assert_allclose(inside.before, [0.5, 0.5, 0.0])
+    np.testing.assert_allclose(inside.after, [0.37754, 0.37754, 0.0], atol=1e-5)
+    outside = judged_answers("b", found, CORRECTION, outside=True)
+    assert not outside.right.any()
+    assert outside.outside.all()
+
+
+def test_a_drive_is_judged_by_corrections_of_its_other_blocks(stock_map, small_dataset, monkeypatch, tmp_path):
+    monkeypatch.setattr(elsewhere, "FEWEST_LEFT", 2)
+    report, localizer = Report("x", "x", folder=tmp_path), Localizer.open(MapBundle.open(stock_map))
+    found = confidence_rows(report, "d", small_dataset, localizer, "drive1_precise")
+    rows, judged_of = rows_of(report), found.judged
+    assert rows["real.d.ece"]["value"] == pytest.approx(judged_of.error(judged_of.before))
+    assert rows["real.d.ece_after_rig_calibration"]["value"] == pytest.approx(judged_of.error(judged_of.after))
+    assert rows["real.d.ece"]["n"] == len(judged_of.right) > 5
+    assert (~judged_of.outside).sum() == 5
 
 
 def test_without_a_drive_there_are_no_calibration_errors(tmp_path):
@@ -187,3 +241,36 @@ def test_without_a_localized_answer_no_share_of_them_is_claimed(tmp_path, answer
     row = rows_of(report)["real.calibrated_on_0005.wrong_of_localized"]
     assert (row["value"], row["n"], row["holds"]) == (None, 0, False)
     assert row["why"] == "scale 1.50, offset -0.50; no LOCALIZED answer"
+
+
+def test_all_recordings_take_part_in_the_pooled_error(tmp_path, monkeypatch, answers_of):
+    """Two drives of two queries, each asked on both maps, and one stereo frame."""
+    two, one = ([[0, 0], [0, 0]], [[0.1, 0], [0.2, 0]]), ([[0, 0]], [[0.1, 0]])
+    answers = {
+        "kitti_0005": answers_of(*two),
+        "kitti_0013": answers_of(*two, status=["LOCALIZED", "AMBIGUOUS"]),
+        "frames": answers_of(*one),
+    }
+    made = {
+        name: streets.Street(name, SimpleNamespace(name=name), SimpleNamespace(name=name)) for name in streets.DRIVES
+    }
+    drive = judged("d", inside=[(0.9, True)] * 2, outside=[0.1] * 2)
+    monkeypatch.setattr(streets, "_street", lambda _report, _data, _work, name: made[name])
+    monkeypatch.setattr(streets, "predict", lambda _localizer, dataset, _queries: answers[dataset.name])
+    monkeypatch.setattr(streets, "stereo_frames", lambda *_: (SimpleNamespace(name="frames"), tmp_path))
+    monkeypatch.setattr(streets, "confidence_rows", lambda *_: DriveConfidence(drive, CORRECTION))
+    monkeypatch.setattr(streets, "peer_rows", lambda *_: (0.1, 0.2, 2))
+    monkeypatch.setattr(streets, "with_correction", lambda localizer, _: localizer)
+    monkeypatch.setattr(streets, "MapBundle", SimpleNamespace(open=lambda _: None))
+    monkeypatch.setattr(streets, "Localizer", SimpleNamespace(open=lambda _: None))
+    for name in ("paper_network", "_stage_rows", "track_rows", "prior_rows", "sequence_rows", "answer_rows"):
+        monkeypatch.setattr(streets, name, lambda *_: None)
+    report = Report("x", "x", folder=tmp_path)
+    streets.street_rows(report, tmp_path, tmp_path)
+    rows = rows_of(report)
+    assert rows["real.strangers.accepted"]["value"] == 0.75
+    assert rows["real.ece"]["n"] == 13
+    assert (
+        "kitti_0013 on the map of kitti_0005 0 and 2, kitti_0005 on the map of kitti_0013 0 and 2, kitti_stereo 1 and 0"
+        in (rows["real.ece"]["why"])
+    )
