@@ -5,8 +5,8 @@ A document marks such a figure by comments, which Markdown does not show::
     <!-- figure: serving full.answers_per_s .0f -->41<!-- /figure -->
     <!-- figure: code false_accept_rate .0% -->2 %<!-- /figure -->
 
-The first word is a report or ``code``. The second is the id of a row or a name of ``CODE``. The third is a format of
-Python; a percentage gets a space. ``make reports`` writes the figures again. A test fails if one is out of date.
+The first word is a report or ``code``. The second is the id of a row or a name of ``CODE``; ``ROW#n`` is the number of samples of a row.
+The third is a format of Python; a percentage gets a space. ``make reports`` writes the figures again. A test fails if one is out of date.
 """
 
 import json
@@ -15,6 +15,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from benchmarks.provenance import ROOT
+from model_training.calibration.own_rig import WRONG_RATE
 from model_training.stock import CALIBRATION
 from service.maps.calibration import Calibration, read_calibration
 from service.option_limits import FALSE_ACCEPT_RATE, SAFE_CONFIDENCE
@@ -40,6 +41,7 @@ def stock_calibration() -> Calibration:
 CODE: dict[str, Callable[[], float]] = {
     "false_accept_rate": lambda: FALSE_ACCEPT_RATE,
     "safe_confidence": lambda: SAFE_CONFIDENCE,
+    "wrong_rate": lambda: WRONG_RATE,
     "structure_gap": lambda: SupportWeights().structure_gap,
     "least_false_accept_rate": lambda: stock_calibration().least_false_accept_rate,
     "localized_from_confidence": lambda: stock_calibration().threshold(FALSE_ACCEPT_RATE),
@@ -60,7 +62,7 @@ def figure(source: str, name: str, form: str) -> str:
 
     Args:
         source: name of a report, or ``code``.
-        name: id of a row, or name in ``CODE``.
+        name: id of a row, ``ROW#n``, or name in ``CODE``.
         form: format specification of Python.
 
     Raises:
@@ -74,7 +76,8 @@ def figure(source: str, name: str, form: str) -> str:
         path = REPORTS / f"{source}.json"
         if not path.exists():
             raise ValueError(f"figure: {source}: report not found; use one of reports/*.json, or code")
-        values = {row["id"]: row["value"] for row in json.loads(path.read_text())["rows"]}
+        rows = json.loads(path.read_text())["rows"]
+        values = {row["id"]: row["value"] for row in rows} | {f"{row['id']}#n": row.get("n") for row in rows}
         if (value := values.get(name)) is None:
             raise ValueError(f"figure: {source} {name}: the report has no such row, or the row has no value")
     shown = format(value, form)

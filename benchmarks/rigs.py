@@ -3,12 +3,12 @@
 from pathlib import Path
 
 from benchmarks.coverage import Coverage, coverage_rows, worst_coverage_rows
-from benchmarks.full import WRONG_OF_LOCALIZED
 from benchmarks.report import Report
 from model_training.calibration.cross_check import FamilyFigures, cross_check, cross_check_groups
 from model_training.calibration.families import NOT_FITTED, related
 from model_training.calibration.fit import CalibrationData
 from model_training.calibration.make import collected
+from model_training.calibration.own_rig import WRONG_RATE
 from model_training.cli.progress import bars
 
 #: Queries on the street with repeating blocks. It is a kind of street, not of rig, and half of its places cannot be told apart.
@@ -89,7 +89,7 @@ def _figure_rows(report: Report, row: str, each: FamilyFigures) -> None:
         f"{row}.wrong_of_localized",
         each.wrong_of_localized if each.accepted else None,
         "share",
-        bar=WRONG_OF_LOCALIZED,
+        bar=WRONG_RATE,
         better="lower",
         n=each.accepted,
         why=None if each.accepted else "no LOCALIZED answer",

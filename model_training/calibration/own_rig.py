@@ -27,7 +27,8 @@ LEAST_SCALE = 0.2
 _SCALES, _OFFSETS = (0.2, 0.35, 0.5, 0.75, 1.0, 1.5), (-4.0, -2.0, -1.0, -0.5, 0.0, 0.5, 1.0, 2.0)
 #: Number of blocks of the cross-validation.
 BLOCKS = 5
-#: Share of wrong answers among accepted answers that a robot's owner usually requires. The report states whether the frames support it.
+#: Share of wrong answers among accepted answers that the default aims at, and that a robot's owner usually requires. The report states
+#: whether the frames support it.
 WRONG_RATE = 0.01
 #: Frames in a bin of the calibration error, at least, and the largest number of bins.
 _BIN_FRAMES, _BINS = 20, 15

@@ -89,8 +89,8 @@ def command(
     false_accept_rate: Annotated[
         float | None,
         typer.Option(
-            help="Share of out-of-map queries that may get the status LOCALIZED. A higher rate than the default also accepts a "
-            "confidence below 0.9.  [default: 0.01]"
+            help="Largest share of the calibration's out-of-map queries with status LOCALIZED. A higher rate than the default also accepts "
+            "a confidence below 0.9.  [default: 0.01]"
         ),
     ] = None,
 ) -> None:

@@ -206,8 +206,8 @@ class Settings(BaseSettings):
         FALSE_ACCEPT_RATE,
         ge=LEAST_FALSE_ACCEPT_RATE,
         lt=1,
-        description="largest share of out-of-map queries with status LOCALIZED. A higher rate than the default also accepts a "
-        "confidence below 0.9",
+        description="largest share of the calibration's out-of-map queries with status LOCALIZED. A higher rate than the default also "
+        "accepts a confidence below 0.9",
     )
     belief_key: SecretStr | None = Field(
         None,

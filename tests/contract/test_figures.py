@@ -84,7 +84,7 @@ def test_what_is_typed_is_found() -> None:
 
 
 def test_figures_take_their_value_from_reports_and_code(tmp_path, monkeypatch) -> None:
-    (tmp_path / "speed.json").write_text('{"rows": [{"id": "a.b", "value": 40.6}, {"id": "none", "value": null}]}')
+    (tmp_path / "speed.json").write_text('{"rows": [{"id": "a.b", "value": 40.6, "n": 7}, {"id": "none", "value": null}]}')
     monkeypatch.setattr(figures, "REPORTS", tmp_path)
     monkeypatch.setitem(CODE, "rate", lambda: 0.025)
     text = "x <!-- figure: speed a.b .0f -->?<!-- /figure --> y <!-- figure: code rate .1% -->0<!-- /figure -->"
@@ -92,6 +92,7 @@ def test_figures_take_their_value_from_reports_and_code(tmp_path, monkeypatch) -
         "x <!-- figure: speed a.b .0f -->41<!-- /figure --> y <!-- figure: code rate .1% -->2.5 %<!-- /figure -->"
     )
     assert without_figures(text) == "x  y "
-    for source, name in (("speed", "c"), ("speed", "none"), ("slow", "a.b"), ("code", "c")):
+    assert figure("speed", "a.b#n", ".0f") == "7"
+    for source, name in (("speed", "c"), ("speed", "none"), ("speed", "none#n"), ("slow", "a.b"), ("code", "c")):
         with pytest.raises(ValueError, match="figure: "):
             figure(source, name, ".0f")
