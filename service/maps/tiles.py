@@ -7,7 +7,7 @@ Their parts together behave like a map of one bundle.
 import threading
 from collections import OrderedDict, defaultdict
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
 
@@ -19,6 +19,7 @@ from service.errors import BundleError, damaged_file
 from service.maps import content as parts
 from service.maps import inverted_file, manifest, streets
 from service.maps.calibration import read_calibration
+from service.maps.checked_tiles import Checked, CheckedTiles, mark_of
 from service.maps.files import json_object, map_array, read_file, require_files
 from service.maps.index import Shortlister, ViewIndex
 from service.maps.inverted_file import InvertedFile
@@ -49,6 +50,10 @@ _NEEDED = (parts.ENCODER_FILE, parts.PLACES_FILE, parts.CALIBRATION_FILE)
 class TileSource(Protocol):
     """Where the tiles of a map come from."""
 
+    @property
+    def checked(self) -> CheckedTiles:
+        """What this process has checked of the tiles. The sources of the versions of a map share it."""
+
     def folder(self, tile: Tile) -> Path:
         """Return a local folder with the complete bundle of a tile. Several threads may ask at once.
 
@@ -64,13 +69,6 @@ class TileSource(Protocol):
 
         Args:
             tiles: the most probable first. They replace those of the call before.
-        """
-
-    def is_compared(self, tile: Tile) -> bool:
-        """Return whether this process has compared the hashes of a tile's files, for example while it fetched them.
-
-        Args:
-            tile: as the manifest of the map lists it.
         """
 
     def used(self, tile: Tile) -> None:
@@ -107,9 +105,11 @@ class LocalTiles:
 
     Attributes:
         path: folder of the map.
+        checked: what this process has checked of the tiles.
     """
 
     path: Path
+    checked: CheckedTiles = field(default_factory=CheckedTiles)
 
     def folder(self, tile: Tile) -> Path:
         """Return the folder of a tile.
@@ -125,14 +125,6 @@ class LocalTiles:
         Args:
             tiles: tiles of the map.
         """
-
-    def is_compared(self, tile: Tile) -> bool:  # noqa: ARG002 - as of TileSource
-        """Return False: nobody has compared the hashes yet.
-
-        Args:
-            tile: a tile of the map.
-        """
-        return False
 
     def used(self, tile: Tile) -> None:
         """Do nothing, because no tile is deleted.
@@ -154,7 +146,8 @@ def open_map(
 
     Args:
         path: folder of the map.
-        verify: compare the hash of every file with the manifest. Those of a tile are compared when it is first opened.
+        verify: compare the hash of every file with the manifest. Those of a tile are compared when it is first opened, unless the source
+            knows that this process has compared them.
         source: where the tiles of a tiled map come from; None takes them from ``path``.
         open_bytes: limit of the size of all open tiles of a tiled map, bytes.
         open_search: opens the search of a map of more than ``MOST_SEARCHED`` tiles; None takes the search index in ``path``.
@@ -178,7 +171,8 @@ class OpenTiles:
         of_map: manifest of the map.
         of_streets: streets of the map; None if it has none.
         source: where the tiles come from.
-        verify: compare the hash of every file of a tile when it is opened for the first time.
+        verify: check the hash of every file of a tile, and every index in it, when the tile opens, unless ``source.checked`` has these
+            files.
         open_bytes: limit of the size of all open tiles, bytes. At least one tile is open.
 
     Attributes:
@@ -200,7 +194,6 @@ class OpenTiles:
         self._street_number = street_numbers(of_streets)
         self._verify, self._limit = verify, open_bytes
         self._expected: tuple[int, ...] = ()
-        self._verified = set[int]()  # numbers of the tiles whose hashes this process has compared
         self._opened: OrderedDict[int, MapBundle] = OrderedDict()
         self._regions: dict[tuple[int, ...], Map] = {}
         self._changing = threading.Lock()
@@ -239,9 +232,8 @@ class OpenTiles:
         with opening:  # other threads that need this tile wait; those that need others do not
             if (known := self._known(number)) is not None:
                 return known
-            made = self._open(self._manifest.tiles[number], verify=self._verify and number not in self._verified)
+            made = self._open(self._manifest.tiles[number])
             with self._changing:
-                self._verified.add(number)
                 self._opened[number] = made
                 self._close_some()
             return made
@@ -337,7 +329,7 @@ class OpenTiles:
             closed, _ = self._opened.popitem(last=False)
             self._regions = {key: region for key, region in self._regions.items() if closed not in key}
 
-    def _open(self, tile: Tile, *, verify: bool) -> MapBundle:
+    def _open(self, tile: Tile) -> MapBundle:
         """Open a tile. A request may do so, and its answer names no folder of the machine and no address."""
         named = f"map {self._manifest.name}, {tile.folder}"
         for is_last in (False, True):
@@ -347,15 +339,19 @@ class OpenTiles:
                 what = f"{named}: the tile cannot be fetched; the log of the service says why"
                 raise BundleError(what, field=error.field) from error
             try:
-                return self._opened_from(folder, tile, verify=verify)
+                return self._opened_from(folder, tile)
             except BundleError as error:
                 if is_last or folder.exists():
                     raise BundleError(error.message.replace(str(folder), named), field=error.field) from error
                 # A cache deleted it meanwhile.
         raise AssertionError  # the last turn returns or raises
 
-    def _opened_from(self, folder: Path, tile: Tile, *, verify: bool) -> MapBundle:
-        bundle = MapBundle.open(folder, verify=verify, compare_hashes=not self._source.is_compared(tile))
+    def _opened_from(self, folder: Path, tile: Tile) -> MapBundle:
+        mark, checked = b"", Checked.ALL
+        if self._verify:
+            mark = mark_of(folder)
+            checked = self._source.checked.get(tile.version, mark)
+        bundle = MapBundle.open(folder, verify=checked < Checked.ALL, compare_hashes=checked < Checked.HASHES)
         if bundle.manifest.version != tile.version:
             raise damaged_file(
                 folder / manifest.FILE, f"version {bundle.manifest.version}, but the map lists {tile.version}"
@@ -368,6 +364,8 @@ class OpenTiles:
             places = places_in_map(bundle, self._street_number, self._manifest.lidar_height_m)
         except KeyError as error:
             raise damaged_file(folder / streets.FILE, f"the map has no street {error.args[0]!r}") from error
+        if self._verify:
+            self._source.checked.add(tile.version, mark, Checked.ALL)
         return replace(bundle, places=places)
 
 
@@ -467,7 +465,8 @@ class TiledMap(Map):
 
         Args:
             path: folder with the manifest and the shared files.
-            verify: compare the hash of every file with the manifest. Those of a tile are compared when it is first opened.
+            verify: compare the hash of every file with the manifest. Those of a tile are compared when it is first opened, unless the
+                source knows that this process has compared them.
             source: where the tiles come from; None takes them from ``path``.
             open_bytes: limit of the size of all open tiles, bytes. At least one tile is open.
             open_search: opens the search of a map of more than ``MOST_SEARCHED`` tiles; None takes the search index in ``path``.

@@ -10,9 +10,10 @@ from pathlib import Path
 
 from service.errors import BundleError, SearchError, StreetfixError
 from service.localization.localizer import Localizer
+from service.maps.checked_tiles import CheckedTiles
 from service.maps.manifest import TILES_FOLDER, Manifest, Tile, read_manifest
 from service.maps.store.stored_map import StoredMap
-from service.maps.tiles import OPEN_BYTES, OpenSearch, TileSource, open_map
+from service.maps.tiles import OPEN_BYTES, LocalTiles, OpenSearch, TileSource, open_map
 from service.runtime.map_registry import MapRegistry, Refused, bundle_paths, duplicate_version_error, version_of
 from service.runtime.serving_table import Key, MapVersion
 from service.runtime.wakeup import Wakeup
@@ -41,8 +42,9 @@ class _LoggedTiles:
     def expect(self, tiles: Sequence[Tile]) -> None:
         self._tiles.expect(tiles)
 
-    def is_compared(self, tile: Tile) -> bool:
-        return self._tiles.is_compared(tile)
+    @property
+    def checked(self) -> CheckedTiles:
+        return self._tiles.checked
 
     def used(self, tile: Tile) -> None:
         self._tiles.used(tile)
@@ -98,6 +100,7 @@ class MapWatcher:
         self._warm, self._open_tile_bytes, self._open_search = warm, open_tile_bytes, open_search
         self._stop, self._wakeup = threading.Event(), Wakeup()
         self._thread: threading.Thread | None = None
+        self._checked = CheckedTiles()  # of all maps in folders
         self._manifests: dict[Path, tuple[Stamp, Manifest]] = {}
         self._failed: dict[Path, tuple[Stamp, StreetfixError]] = {}
         self._due: set[Key] = set()  # versions to unmount
@@ -234,10 +237,11 @@ class MapWatcher:
 
     def _mount(self, bundle: _Bundle) -> StreetfixError | None:
         """Open, warm up and mount a bundle; return the error if that fails."""
-        source, stamp = None, bundle.stamp
+        fetching, stamp = None, bundle.stamp
         try:
             if (stored := self._stored.get(bundle.path.parent)) is not None:
-                source = _LoggedTiles(stored.tiles(bundle.path))
+                fetching = _LoggedTiles(stored.tiles(bundle.path))
+            source = fetching or LocalTiles(bundle.path, self._checked)
             opened = open_map(
                 bundle.path, source=source, open_bytes=self._open_tile_bytes, open_search=self._open_search
             )
@@ -246,7 +250,7 @@ class MapWatcher:
             self._registry.mount(localizer)
         except StreetfixError as error:
             # The store or the search server may answer again, so the next scan tries again.
-            if isinstance(error, SearchError) or (source is not None and source.has_failed):
+            if isinstance(error, SearchError) or (fetching is not None and fetching.has_failed):
                 stamp = _NEVER
             return self._refuse(bundle.path, stamp, error)
         except Exception as error:  # any defect refuses only this bundle; the others are still processed

@@ -12,6 +12,7 @@ from functools import partial
 from pathlib import Path
 
 from service.errors import BundleError
+from service.maps.checked_tiles import Checked, CheckedTiles, mark_of
 from service.maps.content import NOT_SERVED
 from service.maps.manifest import FILE, Manifest, Tile, parsed_manifest, read_manifest
 from service.maps.store.cache import TileCache, is_used_now
@@ -56,6 +57,7 @@ class StoredMap:
     def __init__(self, url: str, cache: TileCache, follow: Follow = _unseen) -> None:
         self.url = checked_url(url)
         self._cache, self._follow = cache, follow
+        self._checked = CheckedTiles()  # of all versions
         key = hashlib.sha256(self.url.encode()).hexdigest()[:12]
         self.folder = cache.folder / f"{_UNUSUAL.sub('_', self.url.rpartition('/')[2])[:64]}-{key}"
         self._remote: Remote | None = None
@@ -96,7 +98,7 @@ class StoredMap:
         Args:
             version: folder of the version, in ``folder``.
         """
-        return StoreTiles(self._opened(), self._cache, version, self._follow)
+        return StoreTiles(self._opened(), self._cache, version, self._follow, self._checked)
 
     def forget(self, keep: Collection[str]) -> None:
         """Delete the folders of other versions than these and the current one. The bound of the cache deletes their tiles.
@@ -131,15 +133,26 @@ class StoreTiles:
         cache: the cache.
         version: folder of a version of the map in the cache.
         follow: follows the fetches.
+        checked: what this process has checked of the tiles of the map, also for other versions; None begins.
+
+    Attributes:
+        checked: as given, or new.
     """
 
-    def __init__(self, remote: Remote, cache: TileCache, version: Path, follow: Follow = _unseen) -> None:
+    def __init__(
+        self,
+        remote: Remote,
+        cache: TileCache,
+        version: Path,
+        follow: Follow = _unseen,
+        checked: CheckedTiles | None = None,
+    ) -> None:
         self._remote, self._cache, self._version, self._follow = remote, cache, version, follow
+        self.checked = checked or CheckedTiles()
         self._expected = deque[Tile]()
         self._expecting = threading.Lock()
         self._fetches_ahead = False
         self._used_s: dict[str, float] = {}
-        self._compared = set[str]()  # versions of the tiles that this process has fetched
         self._shared: Mapping[str, Path] | None = None
 
     def folder(self, tile: Tile) -> Path:
@@ -186,14 +199,6 @@ class StoreTiles:
             ):  # the request that needs the tile fetches it again, and says what is wrong
                 self.folder(tile)
 
-    def is_compared(self, tile: Tile) -> bool:
-        """Return whether this object has fetched a tile, and compared the hashes meanwhile.
-
-        Args:
-            tile: of the map's manifest.
-        """
-        return tile.version in self._compared
-
     def used(self, tile: Tile) -> None:
         """Mark a tile as used, so that the bound of the cache deletes others first. It costs nothing more than once a minute.
 
@@ -220,7 +225,7 @@ class StoreTiles:
         with self._follow("tile", f"{self._remote.url}/{tile.folder}", total) as on_bytes:
             fetch_files(self._remote, f"{tile.folder}/", files, into, on_bytes=on_bytes)
         (into / FILE).write_bytes(data)
-        self._compared.add(tile.version)
+        self.checked.add(tile.version, mark_of(into), Checked.HASHES)  # the mark stays when the folder gets its name
 
     def _shared_by_hash(self) -> Mapping[str, Path]:
         """Return the shared files of the map by their hash. A tile has copies of some, which are hard links in the cache."""

@@ -20,6 +20,7 @@ import pytest
 
 from benchmarks.scale.s3_server import BUCKET, CREDENTIALS
 from service.errors import BundleError, ExtraMissingError
+from service.maps.checked_tiles import Checked, mark_of
 from service.maps.content import NOT_SERVED, BundleContent
 from service.maps.manifest import Manifest, Tile, read_manifest
 from service.maps.reader import MapBundle
@@ -482,11 +483,12 @@ def test_who_fetched_a_tile_has_compared_its_hashes(town: Path, file_url: str, c
     push(town, file_url)
     found, version, manifest, tiles = stored(file_url, cache)
     tile = manifest.tiles[0]
-    assert not tiles.is_compared(tile)
     folder = tiles.folder(tile)
-    assert tiles.is_compared(tile)
+    assert tiles.checked.get(tile.version, mark_of(folder)) == Checked.HASHES
     again = found.tiles(version)
-    assert not again.is_compared(tile)
+    assert again.checked is tiles.checked  # all versions of a map share it
+    TiledMap.open(version, source=again).tiles.get(0)
+    assert tiles.checked.get(tile.version, mark_of(folder)) == Checked.ALL
     views = bytearray((folder / "views.npy").read_bytes())
     views[-1] ^= 1
     (folder / "views.npy").write_bytes(views)
