@@ -68,6 +68,8 @@ def _measure(
     for number in range(len(shifts)):  # every tile is read and checked once
         opened[many].tiles.get(number)
     opened[one].tiles.get(0)
+    for each in opened.values():
+        each.tiles.opens_ahead = True  # as in a service
     for _ in range(ROBOTS):
         home = int(rng.integers(len(shifts)))
         for number in rng.integers(len(queries), size=RUN):

@@ -77,6 +77,14 @@ class Map:
         """
         return self
 
+    def expect_next(self, xy_m: Float64[NDArray[np.float64], "2"], before_m: Float64[NDArray[np.float64], "2"]) -> None:
+        """Take note of where a camera moves. Only a tiled map has tiles to prepare (``TiledMap.expect_next``).
+
+        Args:
+            xy_m: x and y of the camera, map frame, m.
+            before_m: the same one step earlier.
+        """
+
     @property
     def open_tiles(self) -> int:
         """Number of open tiles of a tiled map; 0 for a map of one bundle."""

@@ -5,6 +5,7 @@ Their parts together behave like a map of one bundle.
 """
 
 import threading
+import time
 from collections import OrderedDict, defaultdict
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -18,6 +19,7 @@ from numpy.typing import NDArray
 from service.errors import BundleError, damaged_file
 from service.maps import content as parts
 from service.maps import inverted_file, manifest, streets
+from service.maps.ahead import Ahead
 from service.maps.calibration import read_calibration
 from service.maps.checked_tiles import Checked, CheckedTiles, mark_of
 from service.maps.files import json_object, map_array, read_file, require_files
@@ -39,8 +41,14 @@ MOST_AROUND = 2 * MOST_SEARCHED
 LISTED = 1_000
 #: Limit of the size of all open tiles, bytes. The system keeps only the parts in memory that queries read.
 OPEN_BYTES = 4 * 2**30
-#: Tiles so near to the position of a query are expected next, m.
+#: Tiles so near to the position of a query are expected next, m. The path of a robot is followed twice as far.
 EXPECT_M = 300.0
+#: Largest number of tiles that one query expects.
+MOST_EXPECTED = 8
+#: A shorter step has no direction: the robot stands, m.
+LEAST_STEP_M = 0.05
+#: An expected tile is prepared again after this time, s. Until then it may have been closed, or deleted from a cache.
+PREPARE_EVERY_S = 10.0
 #: Largest number of regions that are kept, each put together from several tiles.
 MOST_REGIONS = 16
 _NEEDED = (parts.ENCODER_FILE, parts.PLACES_FILE, parts.CALIBRATION_FILE)
@@ -54,21 +62,15 @@ class TileSource(Protocol):
     def checked(self) -> CheckedTiles:
         """What this process has checked of the tiles. The sources of the versions of a map share it."""
 
-    def folder(self, tile: Tile) -> Path:
+    def folder(self, tile: Tile, *, ahead: bool = False) -> Path:
         """Return a local folder with the complete bundle of a tile. Several threads may ask at once.
 
         Args:
             tile: as the manifest of the map lists it.
+            ahead: no request waits for it.
 
         Raises:
             BundleError: the tile is missing or damaged, or cannot be fetched.
-        """
-
-    def expect(self, tiles: Sequence[Tile]) -> None:
-        """Prepare tiles that requests will probably need soon, without waiting.
-
-        Args:
-            tiles: the most probable first. They replace those of the call before.
         """
 
     def used(self, tile: Tile) -> None:
@@ -111,20 +113,14 @@ class LocalTiles:
     path: Path
     checked: CheckedTiles = field(default_factory=CheckedTiles)
 
-    def folder(self, tile: Tile) -> Path:
+    def folder(self, tile: Tile, *, ahead: bool = False) -> Path:  # noqa: ARG002 - as of TileSource
         """Return the folder of a tile.
 
         Args:
             tile: as the manifest of the map lists it.
+            ahead: no request waits for it.
         """
         return self.path / tile.folder
-
-    def expect(self, tiles: Sequence[Tile]) -> None:
-        """Do nothing, because the tiles are there.
-
-        Args:
-            tiles: tiles of the map.
-        """
 
     def used(self, tile: Tile) -> None:
         """Do nothing, because no tile is deleted.
@@ -178,6 +174,8 @@ class OpenTiles:
     Attributes:
         squares_m: x0, y0, x1, y1 of each tile, map frame, m.
         first_place: number of the first place of each tile, and the number of all places.
+        opens_ahead: whether tiles that a moving camera may reach soon are fetched, checked and opened in the background. A service switches
+            it on after the first query, which is a random one.
     """
 
     def __init__(
@@ -193,7 +191,9 @@ class OpenTiles:
         self._path, self._manifest, self._source = path, of_map, source
         self._street_number = street_numbers(of_streets)
         self._verify, self._limit = verify, open_bytes
-        self._expected: tuple[int, ...] = ()
+        self.opens_ahead = False
+        self._ahead = Ahead(self._prepare)
+        self._prepared_s: dict[int, float] = {}
         self._opened: OrderedDict[int, MapBundle] = OrderedDict()
         self._regions: dict[tuple[int, ...], Map] = {}
         self._changing = threading.Lock()
@@ -253,20 +253,30 @@ class OpenTiles:
             found.append(int(_away_m(self.squares_m, xy_m[first[row]]).argmin()) if number is None else number)
         return in_order(np.array(found, np.int64))
 
-    def expect_around(self, xy_m: Float64[NDArray[np.float64], "2"]) -> None:
-        """Tell the source which closed tiles a moving camera may reach soon.
+    def expect_around(
+        self, xy_m: Float64[NDArray[np.float64], "2"], before_m: Float64[NDArray[np.float64], "2"] | None = None
+    ) -> None:
+        """Prepare closed tiles that a moving camera may reach soon, in the background. This does nothing unless ``opens_ahead``.
+
+        A prepared tile is in the cache, and its files are checked. It stays open if it fits without closing another one. It is closed
+        before all tiles that queries have used.
 
         Args:
             xy_m: x and y of the camera, map frame, m.
+            before_m: the same one step earlier; None if unknown.
         """
-        away_m = _away_m(self.squares_m, xy_m)
-        near = [int(number) for number in np.argsort(away_m, kind="stable")[:9] if 0 < away_m[number] <= EXPECT_M]
+        if not self.opens_ahead:
+            return
+        near, now_s = expected_next(self.squares_m, xy_m, before_m).tolist(), time.monotonic()
         with self._changing:
-            closed = tuple(number for number in near if number not in self._opened)
-            is_news = bool(closed) and closed != self._expected
-            self._expected = closed
-        if is_news:
-            self._source.expect([self._manifest.tiles[number] for number in closed])
+            closed = [
+                number
+                for number in near
+                if number not in self._opened
+                and now_s - self._prepared_s.get(number, -PREPARE_EVERY_S) >= PREPARE_EVERY_S
+            ]
+        if closed:
+            self._ahead.expect(closed, is_ordered=before_m is not None)
 
     def region(self, numbers: tuple[int, ...], make: Callable[[tuple[int, ...]], Map]) -> Map:
         """Return the parts of some tiles together. They are kept as long as all of these tiles are open.
@@ -316,6 +326,33 @@ class OpenTiles:
             squares_m, cloud_of, middle_m, has_brightness, lambda: self.opened if drawn is None else drawn
         )
 
+    def _prepare(self, number: int) -> None:
+        """Fetch and check a tile, and open it if there is room."""
+        tile = self._manifest.tiles[number]
+        with self._changing:
+            opening = self._opening[number]
+        try:
+            with opening:
+                with self._changing:
+                    if number in self._opened:
+                        return
+                    has_room = self._has_room(tile)
+                if not has_room and self._is_checked(tile, self._source.folder(tile, ahead=True)):
+                    return
+                made = self._open(tile, ahead=True)
+                with self._changing:
+                    if self._has_room(tile):
+                        self._opened[number] = made
+                        self._opened.move_to_end(number, last=False)  # no query has used it
+        finally:
+            self._prepared_s[number] = time.monotonic()
+
+    def _has_room(self, tile: Tile) -> bool:
+        return sum(self._manifest.tiles[number].size for number in self._opened) + tile.size <= self._limit
+
+    def _is_checked(self, tile: Tile, folder: Path) -> bool:
+        return not self._verify or self._source.checked.get(tile.version, mark_of(folder)) == Checked.ALL
+
     def _known(self, number: int) -> MapBundle | None:
         with self._changing:
             if number in self._opened:
@@ -329,12 +366,12 @@ class OpenTiles:
             closed, _ = self._opened.popitem(last=False)
             self._regions = {key: region for key, region in self._regions.items() if closed not in key}
 
-    def _open(self, tile: Tile) -> MapBundle:
+    def _open(self, tile: Tile, *, ahead: bool = False) -> MapBundle:
         """Open a tile. A request may do so, and its answer names no folder of the machine and no address."""
         named = f"map {self._manifest.name}, {tile.folder}"
         for is_last in (False, True):
             try:
-                folder = self._source.folder(tile)
+                folder = self._source.folder(tile, ahead=ahead)
             except BundleError as error:
                 what = f"{named}: the tile cannot be fetched; the log of the service says why"
                 raise BundleError(what, field=error.field) from error
@@ -547,6 +584,15 @@ class TiledMap(Map):
         self.tiles.expect_around(positions_m[0, :2])
         return self._region(self.tiles.at(positions_m[:, :2])[:MOST_AROUND])
 
+    def expect_next(self, xy_m: Float64[NDArray[np.float64], "2"], before_m: Float64[NDArray[np.float64], "2"]) -> None:
+        """Prepare the tiles that a moving camera will probably reach, in the background.
+
+        Args:
+            xy_m: x and y of the camera, map frame, m.
+            before_m: the same one step earlier.
+        """
+        self.tiles.expect_around(xy_m, before_m)
+
     def _region(self, numbers: Int64[NDArray[np.int64], " n"]) -> Map:
         return self.tiles.region(tuple(sorted(numbers.tolist())), self._made)
 
@@ -619,6 +665,40 @@ def finds_tile(
     for number, descriptor in enumerate(descriptors):
         found[number] = owner[number] in chosen_tiles(search, descriptor, every, first_view)
     return found
+
+
+def expected_next(
+    squares_m: Float64[NDArray[np.float64], "T 4"],
+    xy_m: Float64[NDArray[np.float64], "2"],
+    before_m: Float64[NDArray[np.float64], "2"] | None = None,
+) -> Int64[NDArray[np.int64], " n"]:
+    """Return the tiles that a moving camera may reach soon, the most probable first, at most ``MOST_EXPECTED``. Its own is not one of them.
+
+    Without a motion these are the tiles within ``EXPECT_M``, the nearest first. With a motion, the tiles on its straight continuation come
+    first, in their order. The path is followed twice as far as ``EXPECT_M``, because the duration of a step is unknown and only its
+    direction counts. The other tiles follow by their distance from the point ``EXPECT_M`` ahead, so those behind the camera are last.
+
+    Args:
+        squares_m: x0, y0, x1, y1 of each tile, map frame, m.
+        xy_m: x and y of the camera, map frame, m.
+        before_m: the same one step earlier; None if unknown.
+    """
+    away_m = _away_m(squares_m, xy_m)
+    step_m = np.zeros(2) if before_m is None else xy_m - before_m
+    length_m = float(np.linalg.norm(step_m))
+    if not LEAST_STEP_M <= length_m < np.inf:
+        near = np.argsort(away_m, kind="stable")[: MOST_EXPECTED + 1]
+        return near[(away_m[near] > 0) & (away_m[near] <= EXPECT_M)][:MOST_EXPECTED]
+    reach_m, direction = 2 * EXPECT_M, step_m / length_m
+    rows = np.flatnonzero((away_m > 0) & (away_m <= reach_m))
+    # Distance along the path where it enters and leaves each square. A path along an axis is turned a little, so nothing is divided by 0.
+    edges_m = (squares_m[rows].reshape(-1, 2, 2) - xy_m) / np.where(np.abs(direction) < 1e-9, 1e-9, direction)
+    enters_m, leaves_m = edges_m.min(axis=1).max(axis=1), edges_m.max(axis=1).min(axis=1)
+    is_crossed = (enters_m <= leaves_m) & (leaves_m >= 0) & (enters_m <= reach_m)
+    beside_m = _away_m(squares_m[rows], xy_m + EXPECT_M * direction)
+    order = np.lexsort((np.where(is_crossed, enters_m, beside_m), ~is_crossed))
+    wanted = is_crossed | (away_m[rows] <= EXPECT_M)
+    return rows[order[wanted[order]]][:MOST_EXPECTED]
 
 
 def in_order(numbers: Int64[NDArray[np.int64], " n"]) -> Int64[NDArray[np.int64], " m"]:

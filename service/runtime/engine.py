@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from service.errors import BundleError, RequestError, StreetfixError
 from service.geometry.camera import PinholeCamera
+from service.geometry.rigid import inverse
 from service.imaging.decode import DepthEncoding, DepthKind, ImageLimits
 from service.imaging.level import GivenHeight
 from service.imaging.picture_headers import DEFAULT_LIMITS
@@ -254,6 +255,7 @@ class Engine:
         """
         frame = self.encode_and_search(localizer, encoded)
         answer, following = follow(localizer, frame, track, T_previous_camera, odometry_std)
+        expect_next(localizer.bundle, following, T_previous_camera)
         if following.epoch != track.epoch:
             self.metrics.disrupted(localizer.bundle)
         return self._counted(answer, localizer), following
@@ -322,6 +324,20 @@ class Engine:
             hold.shrink_to(query.rgb.nbytes + query.depth_m.size * DEPTH_KEPT)
             hold.leave_with(query.depth_m)
         return query
+
+
+def expect_next(bundle: Map, track: Track, T_previous_camera: NDArray[np.float64] | None) -> None:
+    """Let a tiled map prepare the tiles that a robot moves towards. This changes no answer.
+
+    Args:
+        bundle: the map.
+        track: of the robot, after its last frame.
+        T_previous_camera: odometry, from the last camera's frame to the frame of the camera before it, metres; None if it is unknown.
+    """
+    at = track.belief.modes[0] if track.belief.modes else track.last
+    if at is not None and T_previous_camera is not None:
+        T_map_previous = at.T_map_camera @ inverse(T_previous_camera)
+        bundle.expect_next(at.T_map_camera[:2, 3], T_map_previous[:2, 3])
 
 
 def watcher_of(registry: MapRegistry, settings: Settings) -> MapWatcher:

@@ -13,7 +13,7 @@ from service.localization.localizer import Localizer
 from service.maps.checked_tiles import CheckedTiles
 from service.maps.manifest import TILES_FOLDER, Manifest, Tile, read_manifest
 from service.maps.store.stored_map import StoredMap
-from service.maps.tiles import OPEN_BYTES, LocalTiles, OpenSearch, TileSource, open_map
+from service.maps.tiles import OPEN_BYTES, LocalTiles, OpenSearch, TiledMap, TileSource, open_map
 from service.runtime.map_registry import MapRegistry, Refused, bundle_paths, duplicate_version_error, version_of
 from service.runtime.serving_table import Key, MapVersion
 from service.runtime.wakeup import Wakeup
@@ -39,9 +39,6 @@ class _LoggedTiles:
         self._tiles = tiles
         self.has_failed = False
 
-    def expect(self, tiles: Sequence[Tile]) -> None:
-        self._tiles.expect(tiles)
-
     @property
     def checked(self) -> CheckedTiles:
         return self._tiles.checked
@@ -49,12 +46,13 @@ class _LoggedTiles:
     def used(self, tile: Tile) -> None:
         self._tiles.used(tile)
 
-    def folder(self, tile: Tile) -> Path:
+    def folder(self, tile: Tile, *, ahead: bool = False) -> Path:
         try:
-            return self._tiles.folder(tile)
+            return self._tiles.folder(tile, ahead=ahead)
         except StreetfixError as error:
-            self.has_failed = True
-            _log.error("tile_not_fetched tile=%s reason=%s", tile.folder, error.message)
+            self.has_failed = self.has_failed or not ahead
+            level = logging.INFO if ahead else logging.ERROR  # the request that needs the tile tries again
+            _log.log(level, "tile_not_fetched tile=%s reason=%s", tile.folder, error.message)
             raise
 
 
@@ -247,6 +245,8 @@ class MapWatcher:
             )
             localizer = Localizer.open(opened, provider=self._registry.provider)
             self._warm(localizer)
+            if isinstance(opened, TiledMap):
+                opened.tiles.opens_ahead = True  # the warm-up is a random query, and nobody drives there
             self._registry.mount(localizer)
         except StreetfixError as error:
             # The store or the search server may answer again, so the next scan tries again.

@@ -3,15 +3,12 @@
 import hashlib
 import os
 import re
-import threading
 import time
-from collections import deque
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping
 from contextlib import AbstractContextManager, nullcontext, suppress
 from functools import partial
 from pathlib import Path
 
-from service.errors import BundleError
 from service.maps.checked_tiles import Checked, CheckedTiles, mark_of
 from service.maps.content import NOT_SERVED
 from service.maps.manifest import FILE, Manifest, Tile, parsed_manifest, read_manifest
@@ -149,13 +146,10 @@ class StoreTiles:
     ) -> None:
         self._remote, self._cache, self._version, self._follow = remote, cache, version, follow
         self.checked = checked or CheckedTiles()
-        self._expected = deque[Tile]()
-        self._expecting = threading.Lock()
-        self._fetches_ahead = False
         self._used_s: dict[str, float] = {}
         self._shared: Mapping[str, Path] | None = None
 
-    def folder(self, tile: Tile) -> Path:
+    def folder(self, tile: Tile, *, ahead: bool = False) -> Path:  # noqa: ARG002 - as of TileSource
         """Return the folder with the bundle of a tile; fetch it unless the cache has it.
 
         The bundle lacks the files that the service does not read. The bound of the cache may delete the folder later. Open files stay
@@ -163,6 +157,7 @@ class StoreTiles:
 
         Args:
             tile: of the map's manifest.
+            ahead: no request waits for it.
 
         Raises:
             BundleError: the store cannot be read, a file is damaged, or the cache cannot be used.
@@ -173,31 +168,6 @@ class StoreTiles:
         if not is_there:
             self._cache.once(folder, partial(self._fetch, tile))
         return folder
-
-    def expect(self, tiles: Sequence[Tile]) -> None:
-        """Fetch tiles in the background, one after the other.
-
-        Args:
-            tiles: the most probable first. Those of the call before that are not fetched yet are forgotten.
-        """
-        with self._expecting:
-            self._expected = deque(tiles)
-            if self._fetches_ahead:
-                return
-            self._fetches_ahead = True
-        threading.Thread(target=self._fetch_ahead, name="fetch tiles ahead", daemon=True).start()
-
-    def _fetch_ahead(self) -> None:
-        while True:
-            with self._expecting:
-                if not self._expected:
-                    self._fetches_ahead = False
-                    return
-                tile = self._expected.popleft()
-            with suppress(
-                BundleError, OSError
-            ):  # the request that needs the tile fetches it again, and says what is wrong
-                self.folder(tile)
 
     def used(self, tile: Tile) -> None:
         """Mark a tile as used, so that the bound of the cache deletes others first. It costs nothing more than once a minute.

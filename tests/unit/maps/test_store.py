@@ -16,10 +16,12 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from benchmarks.scale.s3_server import BUCKET, CREDENTIALS
 from service.errors import BundleError, ExtraMissingError
+from service.maps.ahead import Ahead
 from service.maps.checked_tiles import Checked, mark_of
 from service.maps.content import NOT_SERVED, BundleContent
 from service.maps.manifest import Manifest, Tile, read_manifest
@@ -273,8 +275,8 @@ class TestTiles:
         _, version, _, tiles = stored(file_url, cache)
         folder, times = tiles.folder, iter([True, False])
 
-        def deleted(tile: Tile) -> Path:
-            found = folder(tile)
+        def deleted(tile: Tile, **how: bool) -> Path:
+            found = folder(tile, **how)
             if next(times):
                 cache.delete(found)
             return found
@@ -520,16 +522,24 @@ def test_a_fetch_is_followed(town: Path, file_url: str, cache: TileCache) -> Non
 
 def test_expected_tiles_are_fetched_in_the_background(town: Path, file_url: str, cache: TileCache) -> None:
     push(town, file_url)
-    found, _, manifest, tiles = stored(file_url, cache)
-    shutil.rmtree(store_of(file_url) / manifest.tiles[0].folder)  # a failure does not stop the others
-    tiles.expect(manifest.tiles)
-    wanted = {found.folder / tile.folder for tile in manifest.tiles[1:]}
-    deadline = time.monotonic() + 30
-    while not all(each.is_dir() for each in wanted) and time.monotonic() < deadline:
-        time.sleep(0.01)
-    assert all(each.is_dir() for each in wanted)
+    found, version, manifest, tiles = stored(file_url, cache)
+    shutil.rmtree(store_of(file_url) / manifest.tiles[1].folder)  # a failure does not stop the others
+    opened = TiledMap.open(version, source=tiles)
+    prepare, done = opened.tiles._prepare, threading.Semaphore(0)
+
+    def counted(number: int) -> None:
+        try:
+            prepare(number)
+        finally:
+            done.release()
+
+    opened.tiles._ahead, opened.tiles.opens_ahead = Ahead(counted), True
+    opened.expect_next(np.array([50.0, 50.0]), np.array([49.0, 50.0]))  # in tile 0, towards 1 and 2
+    assert all(done.acquire(timeout=60) for _ in range(2))
+    assert opened.tiles.opened == (2,)
+    assert list((found.folder / "tiles").iterdir()) == [found.folder / manifest.tiles[2].folder]
     with pytest.raises(BundleError):
-        tiles.folder(manifest.tiles[0])
+        opened.tiles.get(1)
 
 
 def test_who_waited_for_a_failed_fetch_tries_itself(town: Path, file_url: str, cache: TileCache) -> None:

@@ -19,13 +19,14 @@ from model_training.mapping.stored_map import content_of
 from model_training.stock import CALIBRATION
 from service.errors import BundleError
 from service.localization.localizer import Localizer
-from service.maps import inverted_file
+from service.maps import files, inverted_file
 from service.maps import tiles as tiles_module
+from service.maps.ahead import Ahead
 from service.maps.calibration import Site, read_calibration
 from service.maps.manifest import read_manifest
 from service.maps.reader import MapBundle
 from service.maps.tiled_writer import joined_site, write_tiled
-from service.maps.tiles import LocalTiles, TiledMap, in_order, open_map
+from service.maps.tiles import LocalTiles, TiledMap, expected_next, in_order, open_map
 from service.maps.writer import replace_calibration, write_bundle
 from service.registration.surfel_tiles import nearest_square
 from service.retrieval.prior import Prior
@@ -128,23 +129,167 @@ def test_a_prior_opens_only_its_own_tile(tiled: TiledMap, small_dataset: Any) ->
     assert again.tiles.opened == (0,)
 
 
-def test_closed_tiles_near_a_camera_are_expected_once(tiled_path: Path) -> None:
-    class Source(LocalTiles):
-        def expect(self, tiles: Any) -> None:
-            asked.append([(tile.column, tile.row) for tile in tiles])
+#: Nine squares of 500 m: columns -1 to 1, each with rows -1 to 1. Number 4 is the middle, 7 lies east of it and 5 north of it.
+NINE_M = np.array([[x, y, x + 500.0, y + 500.0] for x in (-500.0, 0.0, 500.0) for y in (-500.0, 0.0, 500.0)])
 
-    asked: list[list[tuple[int, int]]] = []
-    opened = TiledMap.open(tiled_path, source=Source(tiled_path))
-    numbers = [(tile.column, tile.row) for tile in opened.manifest.tiles]
-    middle = opened.tiles.squares_m[0].reshape(2, 2).mean(axis=0)
-    for _ in range(2):
-        opened.tiles.expect_around(middle)
-    assert len(asked) == 1
-    assert sorted(asked[0]) == sorted(numbers[1:])  # that of the camera is opened anyway
-    opened.tiles.get(1)
-    opened.tiles.expect_around(middle)
-    opened.tiles.expect_around(middle + 1e6)
-    assert asked[1:] == ([[n for n in asked[0] if n != numbers[1]]] if len(numbers) > 2 else [])
+
+@pytest.mark.parametrize(
+    ("xy_m", "before_m", "numbers"),
+    [
+        ((250.0, 250.0), None, [1, 3, 5, 7]),  # the corners are 354 m away
+        ((400.0, 250.0), None, [7, 3, 5, 6, 8]),  # 100, 250, 250, 269 and 269 m; the west is 400 m away
+        ((250.0, 250.0), (249.0, 250.0), [7, 3, 5, 1]),  # east, the sides, and what lies behind
+        ((250.0, 250.0), (251.0, 250.0), [1, 3, 5, 7]),
+        ((250.0, 250.0), (250.0, 247.0), [5, 1, 7, 3]),
+        ((300.0, 250.0), (299.0, 249.0), [7, 8, 5, 3, 1]),  # the path crosses 7 after 283 m and 8 after 354 m
+        ((250.0, 250.0), (250.01, 250.0), [1, 3, 5, 7]),  # it stands
+        ((-250.0, 250.0), (-251.0, 250.0), [4, 0, 2]),  # the path ends at 350 m, before square 7
+        ((50.0, 250.0), (49.0, 250.0), [7, 3, 5, 1, 0, 2]),  # it enters square 7 after 450 m
+        ((3000.0, 250.0), None, []),
+        ((3000.0, 250.0), (2999.0, 250.0), []),
+        ((1300.0, 250.0), (1301.0, 250.0), [7]),  # from outside
+    ],
+)
+def test_the_tiles_that_a_camera_reaches_next(
+    xy_m: tuple[float, float], before_m: tuple[float, float] | None, numbers: list[int]
+) -> None:
+    before = None if before_m is None else np.array(before_m)
+    assert expected_next(NINE_M, np.array(xy_m), before).tolist() == numbers
+
+
+def test_most_tiles_that_are_expected() -> None:
+    squares_m = np.array([[50.0 * x, 50.0 * y, 50.0 * x + 50, 50.0 * y + 50] for x in range(20) for y in range(20)])
+    for before_m in (None, np.array([510.0, 524.0])):
+        assert len(expected_next(squares_m, np.array([510.0, 525.0]), before_m)) == tiles_module.MOST_EXPECTED
+    north = expected_next(squares_m, np.array([510.0, 525.0]), np.array([510.0, 524.0]))
+    assert north.tolist() == [20 * 10 + row for row in range(11, 19)]  # along the path, not around the camera
+
+
+class Asked:
+    """Instead of ``Ahead``: what was expected."""
+
+    def __init__(self) -> None:
+        self.calls: list[tuple[list[int], bool]] = []
+
+    def expect(self, items: Any, *, is_ordered: bool) -> None:
+        self.calls.append((list(items), is_ordered))
+
+
+def test_only_closed_tiles_are_expected_and_only_in_a_service(tiled: TiledMap, monkeypatch: pytest.MonkeyPatch) -> None:
+    asked, middle = Asked(), tiled.tiles.squares_m[0].reshape(2, 2).mean(axis=0)
+    monkeypatch.setattr(tiled.tiles, "_ahead", asked)
+    tiled.tiles.expect_around(middle)
+    assert asked.calls == []
+    tiled.tiles.opens_ahead = True
+    tiled.tiles.expect_around(middle)
+    others = [number for number in range(len(tiled.tiles)) if number != 0]  # that of the camera is opened anyway
+    assert [(sorted(numbers), ordered) for numbers, ordered in asked.calls] == [(others, False)]
+    tiled.expect_next(middle, middle - 1.0)
+    assert [(sorted(numbers), ordered) for numbers, ordered in asked.calls[1:]] == [(others, True)]
+    for number in others:
+        tiled.tiles.get(number)
+    tiled.tiles.expect_around(middle)
+    tiled.tiles.expect_around(middle + 1e6)
+    assert len(asked.calls) == 2
+
+
+class Prepared:
+    """Counts the tiles that the background has prepared."""
+
+    def __init__(self, opened: TiledMap) -> None:
+        self._prepare, self._done = opened.tiles._prepare, threading.Semaphore(0)
+        opened.tiles._ahead = Ahead(self._counted)
+        opened.tiles.opens_ahead = True
+
+    def _counted(self, number: int) -> None:
+        try:
+            self._prepare(number)
+        finally:
+            self._done.release()
+
+    def wait(self, tiles: int) -> None:
+        for _ in range(tiles):
+            assert self._done.acquire(timeout=60)
+
+
+@pytest.fixture
+def hashed(monkeypatch: pytest.MonkeyPatch) -> list[Path]:
+    """Files that were hashed."""
+    found: list[Path] = []
+    hash_of = files._hash_of
+    monkeypatch.setattr(files, "_hash_of", lambda file: found.append(file) or hash_of(file))
+    return found
+
+
+def test_expected_tiles_are_checked_and_opened_in_the_background(tiled: TiledMap, hashed: list[Path]) -> None:
+    prepared, others = Prepared(tiled), len(tiled.tiles) - 1
+    tiled.tiles.get(0)
+    hashed.clear()
+    tiled.tiles.expect_around(tiled.tiles.squares_m[0].reshape(2, 2).mean(axis=0))
+    prepared.wait(others)
+    assert set(tiled.tiles.opened) == set(range(len(tiled.tiles)))
+    assert tiled.tiles.opened[-1] == 0  # the tile that a query has used is closed last
+    assert len({file.parent for file in hashed if file.parent.parent.name == "tiles"}) == others
+    hashed.clear()
+    for number in range(len(tiled.tiles)):
+        tiled.tiles.get(number)
+    assert hashed == []
+
+
+def test_no_tile_is_closed_for_an_expected_one(tiled_path: Path, hashed: list[Path]) -> None:
+    tiled = TiledMap.open(tiled_path, open_bytes=read_manifest(tiled_path).tiles[0].size)
+    prepared, others = Prepared(tiled), len(tiled.tiles) - 1
+    tiled.tiles.get(0)
+    tiled.tiles.expect_around(tiled.tiles.squares_m[0].reshape(2, 2).mean(axis=0))
+    prepared.wait(others)
+    assert tiled.tiles.opened == (0,)
+    hashed.clear()
+    tiled.tiles.get(1)  # it was checked ahead
+    assert hashed == []
+    assert tiled.tiles.opened == (1,)
+
+
+def test_a_tile_that_was_opened_ahead_is_closed_first(
+    content_of: Callable[..., Any], encoder_of: Callable[..., bytes], tmp_path: Path
+) -> None:
+    encoder = encoder_of()
+    made = {(column, 0): tmp_path / str(column) for column in range(3)}
+    for (column, _), path in made.items():
+        write_bundle(path, content_of(seed=column, encoder=encoder))
+    tiles = write_tiled(tmp_path / "three", made, TILE_M, name="three").tiles
+    tiled = TiledMap.open(tmp_path / "three", open_bytes=sum(tile.size for tile in tiles) - 1)
+    prepared = Prepared(tiled)
+    tiled.tiles.get(0)
+    tiled.tiles._ahead.expect([1], is_ordered=True)
+    prepared.wait(1)
+    assert tiled.tiles.opened == (1, 0)
+    tiled.tiles.get(2)
+    assert tiled.tiles.opened == (0, 2)
+
+
+def test_a_prepared_tile_is_not_prepared_again_at_once(tiled_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    tiled = TiledMap.open(tiled_path, open_bytes=1)  # no tile is opened ahead
+    prepared, others = Prepared(tiled), len(tiled.tiles) - 1
+    middle = tiled.tiles.squares_m[0].reshape(2, 2).mean(axis=0)
+    tiled.tiles.expect_around(middle)
+    prepared.wait(others)
+    asked = Asked()
+    monkeypatch.setattr(tiled.tiles, "_ahead", asked)
+    tiled.tiles.expect_around(middle)
+    assert asked.calls == []
+    monkeypatch.setattr(tiles_module, "PREPARE_EVERY_S", 0.0)
+    tiled.tiles.expect_around(middle)
+    assert [len(numbers) for numbers, _ in asked.calls] == [others]
+
+
+def test_tiles_that_open_ahead_change_no_answer(tiled_path: Path, small_dataset: Any) -> None:
+    plain, ahead = (Localizer.open(TiledMap.open(tiled_path)) for _ in range(2))
+    assert isinstance(ahead.bundle, TiledMap)
+    ahead.bundle.tiles.opens_ahead = True
+    for query in queries_of(small_dataset, plain.bundle)[:3]:
+        expected, found = plain.localize(query), ahead.localize(query)
+        assert found.T_map_camera_guess.tobytes() == expected.T_map_camera_guess.tobytes()
+        assert found.confidence == expected.confidence
 
 
 def test_tiles_are_closed_beyond_the_limit(tiled_path: Path, small_dataset: Any) -> None:

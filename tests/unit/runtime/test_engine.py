@@ -18,10 +18,13 @@ from service.errors import (
     UnknownMapError,
 )
 from service.geometry.camera import PinholeCamera
+from service.geometry.rigid import R_BODY_OPTICAL, transform_from
+from service.localization.belief import Belief, Mode
+from service.localization.tracker import Track
 from service.maps.reader import MapBundle
 from service.maps.writer import write_bundle
 from service.retrieval.prior import Prior
-from service.runtime.engine import EncodedQuery, Engine, prior_in
+from service.runtime.engine import CarriedTrack, EncodedQuery, Engine, expect_next, prior_in
 from service.runtime.settings import Limits, Settings
 
 Parts = Callable[..., dict[str, bytes]]
@@ -195,3 +198,64 @@ def test_a_map_that_promises_less_than_the_default_is_mounted_if_the_setting_fit
     engine = Engine.open(Settings(maps=(tmp_path / "m",), threads=1, false_accept_rate=0.1))
     assert engine.is_ready
     engine.close()
+
+
+class Expecting:
+    """A map that records what it is told."""
+
+    def __init__(self) -> None:
+        self.calls: list[list[list[float]]] = []
+
+    def expect_next(self, xy_m: Any, before_m: Any) -> None:
+        self.calls.append([xy_m.tolist(), before_m.tolist()])
+
+
+def mode_at(x: float, y: float, weight: float = 0.9) -> Mode:
+    """The camera looks along x of the map."""
+    return Mode(transform_from(R_BODY_OPTICAL, np.array([x, y, 1.0])), np.eye(6), weight, 0, 0.6, 0.8)
+
+
+#: The camera has moved 2 m along its optical axis.
+T_FORWARD = transform_from(np.eye(3), np.array([0.0, 0.0, 2.0]))
+
+
+@pytest.mark.parametrize(
+    ("track", "T_previous_camera", "calls"),
+    [
+        (Track(last=mode_at(10.0, 5.0)), T_FORWARD, [[[10.0, 5.0], [8.0, 5.0]]]),
+        (  # the likeliest mode counts, not the last LOCALIZED answer
+            Track(belief=Belief((mode_at(-3.0, 7.0), mode_at(0.0, 0.0, 0.05)), 0.05, 0.0), last=mode_at(10.0, 5.0)),
+            T_FORWARD,
+            [[[-3.0, 7.0], [-5.0, 7.0]]],
+        ),
+        (Track(last=mode_at(10.0, 5.0)), None, []),  # it is unknown where the camera came from
+        (Track(), T_FORWARD, []),
+    ],
+)
+def test_a_map_is_told_where_a_robot_moves(track: Track, T_previous_camera: Any, calls: Any) -> None:
+    bundle: Any = Expecting()
+    expect_next(bundle, track, T_previous_camera)
+    assert np.array(bundle.calls) == pytest.approx(np.array(calls))
+
+
+def test_a_track_tells_its_map_where_it_moves_after_each_answer_but_the_first(
+    encoded: EncodedQuery,
+    content_of: Callable[..., Any],
+    calibration_json: Callable[..., dict[str, Any]],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    write_bundle(tmp_path / "tiny", content_of(calibration=calibration_json()))
+    told = Expecting()
+    monkeypatch.setattr(MapBundle, "expect_next", lambda _, *both: told.expect_next(*both))
+    engine = Engine.open(Settings(maps=(tmp_path,), threads=1))
+    try:
+        first = engine.localize(replace(encoded, track=CarriedTrack(None, None)))
+        assert told.calls == []
+        second = engine.localize(replace(encoded, track=CarriedTrack(first.sealed_belief, T_FORWARD)))
+    finally:
+        engine.close()
+    ((xy_m, before_m),) = told.calls
+    assert second.answer.belief is not None
+    assert xy_m == second.answer.belief.modes[0].T_map_camera[:2, 3].tolist()
+    assert 0.0 < np.hypot(*np.subtract(xy_m, before_m)) <= 2.0 + 1e-9

@@ -14,6 +14,7 @@ from service.maps.store.remote import Remote
 from service.maps.store.stored_map import StoredMap
 from service.maps.store.transfer import push
 from service.maps.tiled_writer import write_tiled
+from service.maps.tiles import TiledMap
 from service.maps.writer import write_bundle
 from service.runtime.engine import warm_up
 from service.runtime.map_registry import MapRegistry
@@ -142,3 +143,17 @@ def test_a_stored_map_hashes_each_cached_tile_once_and_fetches_only_the_changed_
     assert hashed == []
     (changed,) = {tile.version for tile in second.tiles} - {tile.version for tile in first.tiles}
     assert {name.split("/")[1] for name in fetched if name.startswith(TILES_FOLDER)} == {changed}
+
+
+def test_tiles_are_opened_ahead_after_the_warm_up(write: Write, tmp_path: Path) -> None:
+    """The warm-up is a random query, and nobody drives there."""
+    write("v1", [1, 2])
+    registry, seen = MapRegistry(), []
+    watcher = MapWatcher(
+        registry, [tmp_path / "maps"], warm=lambda localizer: seen.append(localizer.bundle.tiles.opens_ahead)
+    )
+    watcher.open_first()
+    assert seen == [False]
+    opened = registry.get("town").bundle
+    assert isinstance(opened, TiledMap)
+    assert opened.tiles.opens_ahead
