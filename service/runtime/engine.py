@@ -44,6 +44,7 @@ from service.runtime.seal import Seal
 from service.runtime.serving_table import ServingTable
 from service.runtime.settings import MapUrl, Settings
 from service.runtime.threads import limit_pools, usable_cores
+from service.runtime.tile_metrics import TileMetrics
 from service.runtime.tracing import Tracing
 from service.timing import stage, timed_request
 
@@ -124,16 +125,24 @@ class Engine:
         registry: of the maps.
         settings: checked.
         watcher: of the maps folders; None creates one.
+        tiles: metrics that the watcher uses; None creates them.
     """
 
-    def __init__(self, registry: MapRegistry, settings: Settings, watcher: MapWatcher | None = None) -> None:
+    def __init__(
+        self,
+        registry: MapRegistry,
+        settings: Settings,
+        watcher: MapWatcher | None = None,
+        tiles: TileMetrics | None = None,
+    ) -> None:
+        tiles = tiles or TileMetrics()
         self.registry = registry
         self.settings = settings
-        self.watcher = watcher or watcher_of(registry, settings)
+        self.watcher = watcher or watcher_of(registry, settings, tiles)
         self.threads = settings.threads or max(1, usable_cores() // settings.workers)
         self.admission = Admission(threads=self.threads, queue=settings.queue, initializer=limit_pools)
         self.memory = budget_of(settings, threads=self.threads)
-        self.metrics = Metrics(self.admission, registry, self.memory)
+        self.metrics = Metrics(self.admission, registry, self.memory, tiles, self.watcher.cached_tiles)
         self.last_answers = LastAnswers()
         self._seal = Seal(None if settings.belief_key is None else settings.belief_key.get_secret_value())
         endpoint = settings.traces_endpoint
@@ -155,9 +164,10 @@ class Engine:
         """
         limit_pools()
         registry = MapRegistry(provider=settings.provider, table=table)
-        watcher = watcher_of(registry, settings)
+        tiles = TileMetrics()
+        watcher = watcher_of(registry, settings, tiles)
         watcher.open_first(strict=settings.strict)
-        return cls(registry, settings, watcher)
+        return cls(registry, settings, watcher, tiles)
 
     def serve_version(self, name: str, version: str) -> Localizer:
         """Select the serving version of a map, in every worker.
@@ -340,12 +350,13 @@ def expect_next(bundle: Map, track: Track, T_previous_camera: NDArray[np.float64
         bundle.expect_next(at.T_map_camera[:2, 3], T_map_previous[:2, 3])
 
 
-def watcher_of(registry: MapRegistry, settings: Settings) -> MapWatcher:
+def watcher_of(registry: MapRegistry, settings: Settings, tiles: TileMetrics) -> MapWatcher:
     """Return the watcher of the maps of the settings. It has looked at none of them.
 
     Args:
         registry: where maps are mounted.
         settings: checked.
+        tiles: counts the requests of tiles and the fetches.
 
     Raises:
         BundleError: there are maps in object storage, and the folder of the cache cannot be used.
@@ -355,7 +366,8 @@ def watcher_of(registry: MapRegistry, settings: Settings) -> MapWatcher:
     if urls := [each for each in settings.maps if isinstance(each, MapUrl)]:
         cache = TileCache(settings.tile_cache or default_folder(), settings.tile_cache_bytes)
         cache.clean()
-        stored = [StoredMap(each, cache, FetchLog) for each in urls]
+        follow = partial(FetchLog, on_fetched=tiles.fetched)
+        stored = [StoredMap(each, cache, follow, tiles.requested) for each in urls]
     paths = [each for each in settings.maps if isinstance(each, Path)]
     return MapWatcher(
         registry,

@@ -24,10 +24,19 @@ class FetchLog:
         kind: "map" or "tile". It begins the names of the events, such as ``map_fetching`` and ``map_fetched``.
         url: of what is fetched.
         total: bytes of all files.
+        on_fetched: called at the end with the kind, the bytes and the seconds, unless the fetch failed.
     """
 
-    def __init__(self, kind: str, url: str, total: int) -> None:
+    def __init__(
+        self,
+        kind: str,
+        url: str,
+        total: int,
+        *,
+        on_fetched: Callable[[str, int, float], object] = lambda *_: None,
+    ) -> None:
         self._kind, self._url, self._total = kind, url, total
+        self._on_fetched = on_fetched
         self._level = logging.WARNING if kind == "map" else logging.INFO
         self._done = 0
         self._began_s = self._told_s = time.monotonic()
@@ -47,6 +56,7 @@ class FetchLog:
             _log.log(
                 self._level, "%s_fetched url=%s mb=%.1f s=%.1f", self._kind, self._url, self._done / _MB, elapsed_s
             )
+            self._on_fetched(self._kind, self._done, elapsed_s)
 
     def _add(self, size: int) -> None:
         with self._lock:

@@ -163,6 +163,15 @@ class MapWatcher:
         self._tell_refused()
         return events
 
+    def cached_tiles(self) -> dict[str, int]:
+        """Return the number of tiles in the cache for each mounted tiled map in object storage, by its name."""
+        bundles = [localizer.bundle for localizer in self._registry]
+        return {
+            bundle.name: self._stored[bundle.path.parent].cached_tiles()
+            for bundle in bundles
+            if bundle.manifest.tiles and bundle.path.parent in self._stored
+        }
+
     def start(self, interval_s: float) -> None:
         """Start a thread that scans the folders.
 

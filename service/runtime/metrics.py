@@ -1,7 +1,7 @@
 """Prometheus metrics of the service. They hold figures of requests, never their content."""
 
 import os
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from functools import partial
 from pathlib import Path
 
@@ -19,6 +19,7 @@ from service.localization.answer import Answer, Timings
 from service.maps.map import Map
 from service.runtime.admission import Admission, MemoryBudget
 from service.runtime.map_registry import MOST_REFUSED, MapRegistry
+from service.runtime.tile_metrics import TileMetrics
 from service.timing import STAGES
 
 CONTENT_TYPE = CONTENT_TYPE_LATEST
@@ -37,11 +38,21 @@ class Metrics:
         admission: its queue is measured.
         maps: its map versions are reported.
         memory: its reservations are measured.
+        tiles: counters of the cache of maps in object storage.
+        cached_tiles: returns the number of tiles in this cache for each map.
     """
 
-    def __init__(self, admission: Admission, maps: MapRegistry, memory: MemoryBudget) -> None:
+    def __init__(
+        self,
+        admission: Admission,
+        maps: MapRegistry,
+        memory: MemoryBudget,
+        tiles: TileMetrics,
+        cached_tiles: Callable[[], Mapping[str, int]],
+    ) -> None:
         self._registry = CollectorRegistry()
-        self._maps = _Maps(maps)
+        self._maps = _Maps(maps, cached_tiles)
+        tiles.register(self._registry)
         self._is_one_of_several = _FOLDER in os.environ
         if not self._is_one_of_several:
             for collector in (ProcessCollector, PlatformCollector, GCCollector):
@@ -200,8 +211,8 @@ class _Processes(Collector):
 class _Maps(Collector):
     """Mounted maps and refused bundles at the time of the scrape."""
 
-    def __init__(self, maps: MapRegistry) -> None:
-        self._maps = maps
+    def __init__(self, maps: MapRegistry, cached_tiles: Callable[[], Mapping[str, int]]) -> None:
+        self._maps, self._cached_tiles = maps, cached_tiles
 
     def collect(self) -> Iterator[GaugeMetricFamily]:
         """Yield the serving version of each map and the bundles that are not mounted."""
@@ -218,6 +229,14 @@ class _Maps(Collector):
                 tiles.add_metric([manifest.name], localizer.bundle.open_tiles)
         yield maps
         yield tiles
+        cached = GaugeMetricFamily(
+            "streetfix_cached_tiles",
+            "Tiles of each tiled map from object storage in the cache on the disk, which workers share.",
+            labels=["map"],
+        )
+        for name, count in self._cached_tiles().items():
+            cached.add_metric([name], count)
+        yield cached
         refused = self._maps.refused
         yield GaugeMetricFamily(
             "streetfix_bundles_refused", "Bundles in the maps folders that are not mounted.", value=len(refused)

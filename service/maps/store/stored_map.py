@@ -11,7 +11,7 @@ from pathlib import Path
 
 from service.maps.checked_tiles import Checked, CheckedTiles, mark_of
 from service.maps.content import NOT_SERVED
-from service.maps.manifest import FILE, Manifest, Tile, parsed_manifest, read_manifest
+from service.maps.manifest import FILE, TILES_FOLDER, Manifest, Tile, parsed_manifest, read_manifest
 from service.maps.store.cache import TileCache, is_used_now
 from service.maps.store.fetch import OnBytes, fetch_files, shared_files, shared_prefix, tile_manifest
 from service.maps.store.remote import Remote, checked_url
@@ -24,6 +24,9 @@ _UNUSUAL = re.compile(r"[^A-Za-z0-9._-]+")
 #: Follows a fetch. Gets its kind ("map" for the shared files of a map, or "tile"), its URL and the bytes of all files. The context gives a
 #: function that is called with the number of bytes of each piece, from several threads.
 Follow = Callable[[str, str, int], AbstractContextManager[OnBytes]]
+
+#: Takes note of a request of a tile: whether the cache has the tile, and whether the request is ahead of all queries.
+OnRequest = Callable[[bool, bool], object]
 
 
 def _unseen(*_: object) -> AbstractContextManager[OnBytes]:
@@ -42,6 +45,7 @@ class StoredMap:
         url: such as ``s3://bucket/maps/town``.
         cache: the cache.
         follow: follows the fetches.
+        on_request: takes note of the requests of tiles.
 
     Attributes:
         url: as given, without a final slash.
@@ -51,9 +55,11 @@ class StoredMap:
         BundleError: the URL is not valid.
     """
 
-    def __init__(self, url: str, cache: TileCache, follow: Follow = _unseen) -> None:
+    def __init__(
+        self, url: str, cache: TileCache, follow: Follow = _unseen, on_request: OnRequest = lambda *_: None
+    ) -> None:
         self.url = checked_url(url)
-        self._cache, self._follow = cache, follow
+        self._cache, self._follow, self._on_request = cache, follow, on_request
         self._checked = CheckedTiles()  # of all versions
         key = hashlib.sha256(self.url.encode()).hexdigest()[:12]
         self.folder = cache.folder / f"{_UNUSUAL.sub('_', self.url.rpartition('/')[2])[:64]}-{key}"
@@ -89,13 +95,17 @@ class StoredMap:
         """Return the folders of the versions in the cache."""
         return sorted(each.parent for each in self.folder.glob(f"[!.]*/{FILE}"))
 
+    def cached_tiles(self) -> int:
+        """Return the number of tiles in the cache, of all versions and for all processes that share the cache."""
+        return sum(1 for _ in (self.folder / TILES_FOLDER).glob("[!.]*"))
+
     def tiles(self, version: Path) -> "StoreTiles":
         """Return the source of the tiles of a version.
 
         Args:
             version: folder of the version, in ``folder``.
         """
-        return StoreTiles(self._opened(), self._cache, version, self._follow, self._checked)
+        return StoreTiles(self._opened(), self._cache, version, self._follow, self._checked, self._on_request)
 
     def forget(self, keep: Collection[str]) -> None:
         """Delete the folders of other versions than these and the current one. The bound of the cache deletes their tiles.
@@ -131,6 +141,7 @@ class StoreTiles:
         version: folder of a version of the map in the cache.
         follow: follows the fetches.
         checked: what this process has checked of the tiles of the map, also for other versions; None begins.
+        on_request: takes note of the requests of tiles.
 
     Attributes:
         checked: as given, or new.
@@ -143,13 +154,15 @@ class StoreTiles:
         version: Path,
         follow: Follow = _unseen,
         checked: CheckedTiles | None = None,
+        on_request: OnRequest = lambda *_: None,
     ) -> None:
         self._remote, self._cache, self._version, self._follow = remote, cache, version, follow
+        self._on_request = on_request
         self.checked = checked or CheckedTiles()
         self._used_s: dict[str, float] = {}
         self._shared: Mapping[str, Path] | None = None
 
-    def folder(self, tile: Tile, *, ahead: bool = False) -> Path:  # noqa: ARG002 - as of TileSource
+    def folder(self, tile: Tile, *, ahead: bool = False) -> Path:
         """Return the folder with the bundle of a tile; fetch it unless the cache has it.
 
         The bundle lacks the files that the service does not read. The bound of the cache may delete the folder later. Open files stay
@@ -165,6 +178,7 @@ class StoreTiles:
         folder = self._version.parent / tile.folder
         with self._cache.error_context():
             is_there = is_used_now(folder)
+        self._on_request(is_there, ahead)
         if not is_there:
             self._cache.once(folder, partial(self._fetch, tile))
         return folder

@@ -44,3 +44,16 @@ def test_a_failed_fetch_has_no_line_about_its_end(caplog: pytest.LogCaptureFixtu
     with pytest.raises(BundleError):
         fail()
     assert caplog.messages == [f"map_fetching url={URL} mb=0.0 of=5.0"]
+
+
+def test_a_finished_fetch_is_told_with_its_bytes_and_seconds(monkeypatch: pytest.MonkeyPatch) -> None:
+    now_s, told = 100.0, list[tuple[str, int, float]]()
+    monkeypatch.setattr("service.runtime.fetch_log.time.monotonic", lambda: now_s)
+    with FetchLog("tile", URL, 5_000, on_fetched=lambda *each: told.append(each)) as count:
+        now_s += 3.0
+        count(2_000)
+        count(3_000)
+    assert told == [("tile", 5_000, 3.0)]
+    with pytest.raises(BundleError), FetchLog("tile", URL, 5_000, on_fetched=lambda *each: told.append(each)):
+        raise BundleError("damaged")
+    assert len(told) == 1
