@@ -130,10 +130,12 @@ class PreparedRequest(Generic[D]):
     Attributes:
         document: the request of the contract, without images.
         pictures: encoded colour image and encoded depth image of each frame.
+        before: answer to the query before of the same track; None without one.
     """
 
     document: D
     pictures: tuple[tuple[bytes, bytes], ...]
+    before: schema.LocalizeAnswer | None = None
 
 
 def one(
@@ -165,8 +167,10 @@ def one(
     known = {name: about[name] for name in names if name in about}  # type: ignore[literal-required]  # names of RequestOptions
     frame = Frame(rgb=rgb, depth=depth, camera=camera, **known)
     said, pictures = _frame(frame, packing)
-    content = said | _of_all(about) | _track(about.get("track"))
-    return PreparedRequest(_checked(lambda: schema.LocalizeRequest.model_validate(content)), (pictures,))
+    track = about.get("track")
+    content = said | _of_all(about) | _track(track)
+    document = _checked(lambda: schema.LocalizeRequest.model_validate(content))
+    return PreparedRequest(document, (pictures,), None if track is None else track.before)
 
 
 def several(frames: Sequence[Frame], about: SequenceOptions, packing: Packing) -> PreparedRequest[schema.BatchRequest]:

@@ -88,7 +88,7 @@ def localize(prepared: PreparedRequest[schema.LocalizeRequest]) -> Call[schema.L
         "/v1/localize",
         schema.LocalizeAnswer.model_validate_json,
         _parts(prepared, rgb=rgb, depth=depth),
-        {HEADER: cell_of(prepared.document.prior, prepared.document.map)},
+        {HEADER: cell_of(prepared.document.prior, prepared.document.map, prepared.before)},
     )
 
 
