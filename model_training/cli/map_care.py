@@ -208,7 +208,7 @@ def push(
 
 @app.command()
 def pull(
-    url: Annotated[str, typer.Argument(help="URL of a map in object storage.", metavar="URL")],
+    url: Annotated[str, typer.Argument(help="URL of a map in object storage, or URL@VERSION.", metavar="URL")],
     out: Annotated[Path, typer.Argument(help="Folder of the map. It must not exist.", metavar="OUT")],
 ) -> None:
     """Copy a whole map out of object storage.

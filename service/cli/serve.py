@@ -39,7 +39,8 @@ def command(
         list[str] | None,
         typer.Argument(
             metavar="BUNDLE",
-            help="Map bundles, folders of them, or URLs of maps in object storage (s3://, gs://, az://, file://).",
+            help="Map bundles, folders of them, or URLs of maps in object storage (s3://, gs://, az://, file://). "
+            "URL@VERSION serves one version.",
             show_default=False,
         ),
     ] = None,

@@ -24,7 +24,7 @@ from pydantic_settings import (
 from service.errors import BundleError, RequestError
 from service.imaging.picture_headers import DEFAULT_LIMITS
 from service.maps.search_address import COLLECTION, QUERY_S, checked_name, checked_search_url
-from service.maps.store.remote import checked_url, is_url
+from service.maps.store.remote import checked_url, is_url, split_version
 from service.maps.tiles import OPEN_BYTES
 from service.option_limits import FALSE_ACCEPT_RATE, LEAST_FALSE_ACCEPT_RATE
 from service.retrieval.encoder import Provider
@@ -43,7 +43,7 @@ _NOT_SHOWN = ("qdrant_url", "qdrant_api_key")
 
 
 class MapUrl(str):
-    """URL of a map in object storage, such as ``s3://bucket/maps/town``.
+    """URL of a map in object storage, such as ``s3://bucket/maps/town``, or ``s3://bucket/maps/town@VERSION`` for one version.
 
     Raises:
         ValueError: the URL is not valid.
@@ -54,6 +54,7 @@ class MapUrl(str):
     def __new__(cls, text: str) -> "MapUrl":
         """Check the URL."""
         try:
+            split_version(text)
             return super().__new__(cls, checked_url(text))
         except BundleError as error:  # pydantic reports it with the name of the setting
             raise ValueError(error.message) from error
@@ -94,7 +95,8 @@ class Settings(BaseSettings):
     )
 
     maps: Annotated[tuple[Path | MapUrl, ...], NoDecode] = Field(
-        (), description="map bundles, folders of them, or URLs of maps in object storage, separated by ':'"
+        (),
+        description="map bundles, folders of them, or URLs of maps in object storage (URL@VERSION for one version), separated by ':'",
     )
     tile_cache: Path | None = Field(
         None,
@@ -258,6 +260,15 @@ class Settings(BaseSettings):
         if not isinstance(given, Iterable):
             return given
         return tuple(MapUrl(each) if isinstance(each, str) and is_url(each) else each for each in given if each)
+
+    @field_validator("maps")
+    @classmethod
+    def _one_version_each(cls, value: tuple[Path | MapUrl, ...]) -> tuple[Path | MapUrl, ...]:
+        urls = {each for each in value if isinstance(each, MapUrl)}
+        maps = [split_version(each)[0] for each in urls]
+        if twice := [each for each in maps if maps.count(each) > 1]:
+            raise ValueError(f"{twice[0]} is given with two versions; give one of them, or only the URL")
+        return value
 
     @field_validator("allowed_hosts", mode="before")
     @classmethod

@@ -152,6 +152,36 @@ def shared_files(manifest: Manifest, where: str, *, leave_out: Collection[str] =
     return {name: entry for name, entry in manifest.files.items() if name not in leave_out}
 
 
+def manifest_of_version(remote: Remote, version: str) -> tuple[Manifest, bytes]:
+    """Read the manifest of one version of a map.
+
+    ``map push`` keeps the manifests of all versions. A folder that another tool copied has only the current one.
+
+    Args:
+        remote: the store of the map.
+        version: of the map.
+
+    Returns:
+        The manifest, and its bytes.
+
+    Raises:
+        BundleError: the store does not have this version, the manifest is damaged, or the store cannot be read.
+    """
+    name = f"{VERSIONS_FOLDER}/{version}/{FILE}"
+    data = remote.read_if_there(name)
+    if data is None:
+        name, found = FILE, remote.read(FILE)
+        data = b"" if found is None else found[0]
+    manifest = parsed_manifest(data, f"{remote.url}/{name}")
+    if manifest.version != version:
+        raise BundleError(
+            f"{remote.url}: version {version} is not in the store ({name} has version {manifest.version}); push this version "
+            "(streetfix map push), or name another one",
+            field="maps",
+        )
+    return manifest, data
+
+
 def shared_prefix(remote: Remote, manifest: Manifest) -> str:
     """Return where the shared files of a map are, as ``fetch_files`` needs it.
 

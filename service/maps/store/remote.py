@@ -37,6 +37,7 @@ _NO_HTTP = "builder error"
 #: Query of an address in an error. The signature of Azure is in there.
 _QUERY = re.compile(r"\?\S*")
 _STATUS = re.compile(r"status code: (\d{3}[^:\n]*)")
+_VERSION = re.compile(r"[0-9a-f]{16}")
 _CODE = re.compile(r"<Code>(\w{1,64})</Code>")
 
 
@@ -113,6 +114,26 @@ def checked_url(text: str, content: Content = MAP) -> str:
     if parts.scheme != "file" and not parts.netloc:
         raise _wrong_url(content, parts.scheme, "names no bucket; write s3://BUCKET/PATH")
     return f"{parts.scheme}{text[len(parts.scheme) :]}".rstrip("/")
+
+
+def split_version(text: str) -> tuple[str, str | None]:
+    """Return the URL of a map as ``checked_url`` returns it, and the version that ``URL@VERSION`` names; None for the current version.
+
+    Args:
+        text: such as ``s3://bucket/maps/town`` or ``s3://bucket/maps/town@3f9c2a7be01d4586``.
+
+    Raises:
+        BundleError: the URL is not valid (``checked_url``), or what follows the ``@`` is no version.
+    """
+    url = checked_url(text)
+    folder, slash, last = url.rpartition("/")
+    name, is_pinned, version = last.partition("@")
+    if not is_pinned:
+        return url, None
+    if not _VERSION.fullmatch(version):
+        what = "has an '@' without a version behind it; write URL@VERSION with the 16 hexadecimal digits of a version, or no '@'"
+        raise _wrong_url(MAP, _scheme_of(url), what)
+    return checked_url(f"{folder}{slash}{name}"), version
 
 
 def _scheme_of(url: str) -> str:

@@ -9,12 +9,20 @@ from contextlib import AbstractContextManager, nullcontext, suppress
 from functools import partial
 from pathlib import Path
 
+from service.errors import BundleError
 from service.maps.checked_tiles import Checked, CheckedTiles, mark_of
 from service.maps.content import NOT_SERVED
 from service.maps.manifest import FILE, TILES_FOLDER, Manifest, Tile, parsed_manifest, read_manifest
 from service.maps.store.cache import TileCache, is_used_now
-from service.maps.store.fetch import OnBytes, fetch_files, shared_files, shared_prefix, tile_manifest
-from service.maps.store.remote import Remote, checked_url
+from service.maps.store.fetch import (
+    OnBytes,
+    fetch_files,
+    manifest_of_version,
+    shared_files,
+    shared_prefix,
+    tile_manifest,
+)
+from service.maps.store.remote import Remote, split_version
 
 #: Time between two marks of an open tile as used, s.
 USED_EVERY_S = 60.0
@@ -37,18 +45,21 @@ def _unseen(*_: object) -> AbstractContextManager[OnBytes]:
 class StoredMap:
     """A map under a URL, and its folder in the cache. Threads and processes may share the cache.
 
+    The URL names the current version of the map, or one version: ``URL@VERSION``. Both have the same folder.
+
     ``folder`` has a folder for each version of the map, with ``manifest.json`` and the shared files. Its folder ``tiles`` has the tiles
     that ``StoreTiles`` has fetched. All versions share them. A map without tiles is fetched whole. Files that the service does not read
     are left out.
 
     Args:
-        url: such as ``s3://bucket/maps/town``.
+        url: such as ``s3://bucket/maps/town``, or with a version ``s3://bucket/maps/town@3f9c2a7be01d4586``.
         cache: the cache.
         follow: follows the fetches.
         on_request: takes note of the requests of tiles.
 
     Attributes:
-        url: as given, without a final slash.
+        url: as given, without a final slash and without the version.
+        pinned: the version that the URL names; None follows the current one.
         folder: folder of the map in the cache.
 
     Raises:
@@ -58,7 +69,7 @@ class StoredMap:
     def __init__(
         self, url: str, cache: TileCache, follow: Follow = _unseen, on_request: OnRequest = lambda *_: None
     ) -> None:
-        self.url = checked_url(url)
+        self.url, self.pinned = split_version(url)
         self._cache, self._follow, self._on_request = cache, follow, on_request
         self._checked = CheckedTiles()  # of all versions
         key = hashlib.sha256(self.url.encode()).hexdigest()[:12]
@@ -68,14 +79,20 @@ class StoredMap:
         self._version: str | None = None
 
     def refresh(self) -> None:
-        """Fetch the shared files of the current version, unless the cache has them.
+        """Fetch the shared files of the pinned or the current version, unless the cache has them.
 
-        The store sends the manifest only if it has changed since the last call.
+        The store sends the current manifest only if it has changed since the last call. A pinned version never changes, so nothing is
+        requested if the cache has it.
 
         Raises:
-            BundleError: the store cannot be read, a file is damaged, or the cache cannot be used.
+            BundleError: the store cannot be read or lacks the pinned version, a file is damaged, or the cache cannot be used.
             ExtraMissingError: obstore is not installed.
         """
+        if self.pinned is not None:
+            if not (self.folder / self.pinned / FILE).exists():
+                manifest, data = manifest_of_version(self._opened(), self.pinned)
+                self._cache.once(self.folder / self.pinned, partial(self._fetch_version, manifest, data))
+            return
         remote = self._opened()
         found = remote.read(FILE, unless=self._etag)
         if found is None:
@@ -92,8 +109,8 @@ class StoredMap:
         self._etag, self._version = etag, manifest.version
 
     def versions(self) -> list[Path]:
-        """Return the folders of the versions in the cache."""
-        return sorted(each.parent for each in self.folder.glob(f"[!.]*/{FILE}"))
+        """Return the folders of the versions in the cache that may be served: only the pinned one, if one is pinned."""
+        return sorted(each.parent for each in self.folder.glob(f"{self.pinned or '[!.]*'}/{FILE}"))
 
     def cached_tiles(self) -> int:
         """Return the number of tiles in the cache, of all versions and for all processes that share the cache."""
@@ -109,6 +126,8 @@ class StoredMap:
 
     def forget(self, keep: Collection[str]) -> None:
         """Delete the folders of other versions than these and the current one. The bound of the cache deletes their tiles.
+
+        With a pinned version this deletes nothing, because services with other versions may share the cache.
 
         Args:
             keep: versions.
@@ -212,10 +231,16 @@ class StoreTiles:
         self.checked.add(tile.version, mark_of(into), Checked.HASHES)  # the mark stays when the folder gets its name
 
     def _shared_by_hash(self) -> Mapping[str, Path]:
-        """Return the shared files of the map by their hash. A tile has copies of some, which are hard links in the cache."""
+        """Return the shared files of the map by their hash. A tile has copies of some, which are hard links in the cache.
+
+        There are none if another service has deleted the folder of the version meanwhile.
+        """
         if self._shared is None:
-            manifest = read_manifest(self._version)
+            try:
+                files = read_manifest(self._version).files
+            except BundleError:
+                return {}
             self._shared = {
-                entry.sha256: self._version / name for name, entry in manifest.files.items() if name not in NOT_SERVED
+                entry.sha256: self._version / name for name, entry in files.items() if name not in NOT_SERVED
             }
         return self._shared

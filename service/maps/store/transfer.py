@@ -17,12 +17,13 @@ from service.maps.store.fetch import (
     concurrently,
     fetch_files,
     is_manifest_of,
+    manifest_of_version,
     parsed_tile_manifest,
     shared_files,
     shared_prefix,
     tile_manifest,
 )
-from service.maps.store.remote import Remote
+from service.maps.store.remote import Remote, split_version
 from service.maps.writer import sha256_of
 
 #: Progress callback: stage, finished units, all units.
@@ -81,9 +82,13 @@ def push(folder: Path, url: str, *, report: Report = lambda *_: None) -> Copied:
         report: called with the copied MB.
 
     Raises:
-        BundleError: the map is damaged, or the store cannot be written.
+        BundleError: the URL names a version, the map is damaged, or the store cannot be written.
         ExtraMissingError: obstore is not installed.
     """
+    if split_version(url)[1] is not None:
+        raise BundleError(
+            f"{url} names a version, but a push writes that of the map; leave out '@VERSION'", field="url"
+        )
     manifest = read_manifest(folder)
     remote = Remote.open(url, create=True)
     data = _read(folder / FILE)
@@ -115,7 +120,7 @@ def pull(url: str, out: Path, *, report: Report = lambda *_: None) -> Copied:
     Finished tiles stay in ``.NAME.pulling`` beside ``out`` until the map is whole.
 
     Args:
-        url: URL of the map in the store.
+        url: URL of the map in the store; ``URL@VERSION`` copies that version, and not the current one.
         out: folder of the map; it must not exist.
         report: called with the copied MB.
 
@@ -126,10 +131,14 @@ def pull(url: str, out: Path, *, report: Report = lambda *_: None) -> Copied:
     """
     if out.exists():
         raise BundleError(f"{out}: already exists; choose another folder", field="out")
+    url, version = split_version(url)
     remote = Remote.open(url)
-    found = remote.read(FILE)
-    data = b"" if found is None else found[0]
-    manifest = parsed_manifest(data, f"{remote.url}/{FILE}")
+    if version is None:
+        found = remote.read(FILE)
+        data = b"" if found is None else found[0]
+        manifest = parsed_manifest(data, f"{remote.url}/{FILE}")
+    else:
+        manifest, data = manifest_of_version(remote, version)
     pulling = out.parent / f".{out.name}.pulling"
     try:
         pulling.mkdir(parents=True, exist_ok=True)

@@ -29,7 +29,7 @@ from service.maps.reader import MapBundle
 from service.maps.store import cache as cache_module
 from service.maps.store import fetch, remote, transfer
 from service.maps.store.cache import TileCache
-from service.maps.store.remote import Remote, checked_url
+from service.maps.store.remote import Remote, checked_url, split_version
 from service.maps.store.stored_map import StoredMap, StoreTiles
 from service.maps.store.transfer import pull, push
 from service.maps.tiled_writer import write_tiled
@@ -86,6 +86,13 @@ def stored(url: str, cache: TileCache) -> tuple[StoredMap, Path, Manifest, Store
     found.refresh()
     (version,) = [each for each in found.folder.iterdir() if (each / "manifest.json").exists()]
     return found, version, read_manifest(version), found.tiles(version)
+
+
+def stored_all(url: str, cache: TileCache) -> tuple[StoredMap, list[Path]]:
+    """A map with all its versions in the cache."""
+    found = StoredMap(url, cache)
+    found.refresh()
+    return found, found.versions()
 
 
 def same_files(one: Path, other: Path) -> bool:
@@ -643,6 +650,93 @@ class TestVersions:
         found.refresh()
         assert read_manifest(version).made_at == later.made_at
 
+    def test_a_pinned_version_is_served_although_the_store_has_a_newer_one(
+        self, town: Path, url: str, cache: TileCache, content_of: Content, encoder_of: Any, tmp_path: Path
+    ) -> None:
+        old = read_manifest(town)
+        push(town, url)
+        new = write_tiled_map(tmp_path / "larger", content_of, encoder_of(), tiles=4)
+        push(tmp_path / "larger", url)
+        pinned = StoredMap(f"{url}@{old.version}/", cache)
+        assert (pinned.url, pinned.pinned) == (url, old.version)
+        pinned.refresh()
+        (version,) = pinned.versions()
+        assert read_manifest(version) == old
+        opened = TiledMap.open(version, source=pinned.tiles(version))
+        assert opened.tiles.get(0).manifest.version == old.tiles[0].version
+        follows, *_ = stored_all(url, cache)
+        assert follows.folder == pinned.folder  # both share the tiles
+        assert {each.name for each in follows.versions()} == {old.version, new.version}
+        pinned.forget(())  # the other service needs the new version
+        assert {each.name for each in follows.versions()} == {old.version, new.version}
+        assert pinned.versions() == [version]
+
+    def test_a_pinned_version_in_the_cache_needs_no_store(self, town: Path, file_url: str, cache: TileCache) -> None:
+        push(town, file_url)
+        pinned = f"{file_url}@{read_manifest(town).version}"
+        StoredMap(pinned, cache).refresh()
+        shutil.rmtree(store_of(file_url))
+        again = StoredMap(pinned, cache)
+        again.refresh()
+        assert len(again.versions()) == 1
+
+    def test_a_version_that_the_store_lacks_is_an_error_that_names_the_current_one(
+        self, town: Path, url: str, cache: TileCache, tmp_path: Path
+    ) -> None:
+        push(town, url)
+        missing = StoredMap(f"{url}@{16 * '0'}", cache)
+        told = (
+            rf"{url}: version 0{{16}} is not in the store \(manifest.json has version {read_manifest(town).version}\)"
+        )
+        with pytest.raises(BundleError, match=told):
+            missing.refresh()
+        assert missing.versions() == []
+        with pytest.raises(BundleError, match=told):
+            pull(f"{url}@{16 * '0'}", tmp_path / "back")
+
+    def test_the_only_version_of_a_folder_that_another_tool_copied_can_be_pinned(
+        self, town: Path, tmp_path: Path, cache: TileCache
+    ) -> None:
+        shutil.copytree(town, tmp_path / "store" / "town")
+        pinned = StoredMap(f"file://{tmp_path}/store/town@{read_manifest(town).version}", cache)
+        pinned.refresh()
+        (version,) = pinned.versions()
+        MapBundle.open(pinned.tiles(version).folder(read_manifest(version).tiles[0]))
+
+    def test_a_version_in_the_folder_of_another_one_is_refused(
+        self, town: Path, file_url: str, cache: TileCache
+    ) -> None:
+        push(town, file_url)
+        versions = store_of(file_url) / "versions"
+        (versions / read_manifest(town).version).rename(versions / (16 * "0"))
+        with pytest.raises(BundleError, match=r"version 0{16} is not in the store \(versions/0{16}/manifest.json has"):
+            StoredMap(f"{file_url}@{16 * '0'}", cache).refresh()
+
+    def test_a_pull_copies_the_version_that_the_url_names(
+        self, town: Path, file_url: str, content_of: Content, encoder_of: Any, tmp_path: Path
+    ) -> None:
+        push(town, file_url)
+        write_tiled_map(tmp_path / "larger", content_of, encoder_of(), tiles=4)
+        push(tmp_path / "larger", file_url)
+        pull(f"{file_url}@{read_manifest(town).version}", tmp_path / "back")
+        assert same_files(town, tmp_path / "back")
+
+    def test_a_push_to_a_version_is_refused(self, town: Path, file_url: str) -> None:
+        with pytest.raises(
+            BundleError, match="names a version, but a push writes that of the map; leave out '@VERSION'"
+        ):
+            push(town, f"{file_url}@{16 * '0'}")
+        assert not store_of(file_url).exists()
+
+    def test_tiles_are_fetched_although_the_folder_of_their_version_is_gone(
+        self, town: Path, file_url: str, cache: TileCache
+    ) -> None:
+        """A service with another version of the map, on the same cache, has deleted it."""
+        push(town, file_url)
+        _, version, manifest, tiles = stored(file_url, cache)
+        shutil.rmtree(version)
+        MapBundle.open(tiles.folder(manifest.tiles[0]))
+
     def test_a_map_of_one_bundle_is_fetched_whole(self, bundle_path: Path, url: str, cache: TileCache) -> None:
         push(bundle_path, url)
         _, version, *_ = stored(url, cache)
@@ -703,6 +797,21 @@ class TestErrors:
         with pytest.raises(BundleError, match=told) as error:
             checked_url(url)
         assert "secret" not in error.value.message
+
+    @pytest.mark.parametrize(
+        "version", ["", "v2", "3F9C2A7BE01D4586", "3f9c2a7be01d458", f"3f9c2a7be01d4586@{16 * '0'}"]
+    )
+    def test_what_follows_an_at_sign_must_be_a_version(self, version: str, cache: TileCache) -> None:
+        with pytest.raises(
+            BundleError, match="has an '@' without a version behind it; write URL@VERSION with the 16 hex"
+        ):
+            StoredMap(f"s3://bucket/maps/town@{version}", cache)
+
+    def test_a_url_and_its_version_are_told_apart(self) -> None:
+        assert split_version("s3://bucket/a@b/town/") == ("s3://bucket/a@b/town", None)
+        assert split_version("gs://bucket/town@3f9c2a7be01d4586") == ("gs://bucket/town", "3f9c2a7be01d4586")
+        with pytest.raises(BundleError, match="names no folder"):
+            split_version("file:///@3f9c2a7be01d4586")
 
     def test_a_signature_in_an_address_is_not_told(self) -> None:
         error = remote._failed(

@@ -42,9 +42,11 @@ class Town:
         push(out, self.url)
         return made.version
 
-    def service(self) -> tuple[MapRegistry, MapWatcher]:
+    def service(self, version: str | None = None) -> tuple[MapRegistry, MapWatcher]:
+        """A service that follows the current version, or serves only one."""
         registry = MapRegistry()
-        stored = StoredMap(self.url, TileCache(self.folder / "cache", 10**9))
+        url = self.url if version is None else f"{self.url}@{version}"
+        stored = StoredMap(url, TileCache(self.folder / "cache", 10**9))
         return registry, MapWatcher(registry, [], warm=lambda each: warm_up(0.01, each), stored=[stored])
 
     @property
@@ -88,6 +90,36 @@ def test_a_restart_serves_the_version_that_the_store_was_rolled_back_to(town: To
     watcher.open_first()
     assert version_of(again) == first
     assert town.cached == {first}
+
+
+def test_a_pinned_version_is_rolled_out_and_back_service_by_service(town: Town) -> None:
+    """The cache also has the newer version, which would serve without the pin."""
+    first = town.push()
+    follows, watcher_follows = town.service()
+    watcher_follows.open_first()
+    second = town.push()
+    watcher_follows.scan()
+    pinned, watcher = town.service(first)
+    watcher.open_first()
+    assert (version_of(follows), version_of(pinned)) == (second, first)
+    third = town.push()
+    assert watcher.scan() == watcher.scan(drop_missing=True) == []
+    assert version_of(pinned) == first
+    watcher_follows.scan()
+    assert version_of(follows) == third
+    for version in (third, first, second):  # the next services roll forward and back
+        registry, watcher = town.service(version)
+        watcher.open_first()
+        assert version_of(registry) == version
+        assert len(registry.versions("town")) == 1
+    assert version_of(follows) == third
+
+
+def test_a_pinned_version_that_the_store_lacks_does_not_start(town: Town) -> None:
+    town.push()
+    town.service()[1].open_first()  # another version in the cache does not serve instead
+    with pytest.raises(BundleError, match=r"version 0{16} is not in the store"):
+        town.service(16 * "0")[1].open_first()
 
 
 def test_versions_that_nobody_has_mounted_leave_the_cache(town: Town) -> None:
@@ -180,6 +212,21 @@ def test_a_url_with_credentials_is_refused_without_telling_them(monkeypatch: pyt
     with pytest.raises(RequestError, match=r"setting maps: the URL s3://\.\.\. of a map has credentials") as told:
         load_settings()
     assert "hidden" not in told.value.message
+
+
+def test_a_version_in_a_url_is_checked(monkeypatch: pytest.MonkeyPatch) -> None:
+    version = "3f9c2a7be01d4586"
+    monkeypatch.setenv("STREETFIX_MAPS", f"s3://bucket/town@{version}:s3://bucket/city")
+    assert load_settings().maps == (MapUrl(f"s3://bucket/town@{version}"), MapUrl("s3://bucket/city"))
+    monkeypatch.setenv("STREETFIX_MAPS", "s3://bucket/town@v2")
+    with pytest.raises(RequestError, match=r"setting maps: the URL s3://\.\.\. of a map has an '@' without a version"):
+        load_settings()
+    for other in ("s3://bucket/town/", f"s3://bucket/town@{16 * '0'}"):
+        monkeypatch.setenv("STREETFIX_MAPS", f"s3://bucket/town@{version}:{other}")
+        with pytest.raises(RequestError, match="setting maps: s3://bucket/town is given with two versions; give one"):
+            load_settings()
+    monkeypatch.setenv("STREETFIX_MAPS", "s3://bucket/town:s3://bucket/town")
+    assert len(load_settings().maps) == 2
 
 
 def test_the_usual_cache_is_in_the_home_folder(monkeypatch: pytest.MonkeyPatch) -> None:
