@@ -14,6 +14,8 @@ LEAST_SIDE, MOST_ASPECT = 2, 16
 LEAST_HEIGHT_M, MOST_HEIGHT_M = 0.05, 30.0
 #: Limits of the standard deviation of a given height, and its default, metres.
 LEAST_HEIGHT_STD_M, MOST_HEIGHT_STD_M, HEIGHT_STD_M = 0.005, 2.0, 0.05
+#: Limits of the baseline of a stereo rig, metres.
+LEAST_BASELINE_M, MOST_BASELINE_M = 1e-3, 100
 #: Standard deviation of a height that follows from the camera's pose on the vehicle, metres: tyres, suspension and load.
 VEHICLE_HEIGHT_STD_M = 0.1
 #: Limits of the standard deviations of odometry: per axis, metres and degrees.

@@ -4,23 +4,26 @@ import time
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from service.bridge.diagnostics import Counts, Diagnosis, Level, of_answer
+from service.bridge.known import Known
 from service.bridge.pairs import Pair, Pairs, nanoseconds_of
 from service.bridge.pictures import camera_from, depth_from, is_rectified_by_name, rgb_from
 from service.bridge.pose import CAMERA_AS_BODY, StampedPose, pose_of
 from service.bridge.publish_policy import PublishPolicy
+from service.bridge.robot import Robot
 from service.contract.schema import LocalizeAnswer
 from service.errors import StreetfixError
 from service.geometry.camera import PinholeCamera
 from service.geometry.rigid import Transform
 
-#: Localizes an RGB image (H, W, 3) and a depth image (H, W) in metres with their intrinsics: by a client, or by the pipeline in this
-#: process.
-Localize = Callable[[NDArray[np.uint8], NDArray[np.float32], PinholeCamera], LocalizeAnswer]
+#: Localizes an RGB image (H, W, 3) and a depth image (H, W) in metres with their intrinsics and what is known beside them: by a client,
+#: or by the pipeline in this process.
+Localize = Callable[[NDArray[np.uint8], NDArray[np.float32], PinholeCamera, Known], LocalizeAnswer]
 #: Number of queries over which the reported rate is averaged.
 _RECENT = 10
 #: Longest time without images and without a diagnosis, seconds; a slow query rate makes it longer.
@@ -29,7 +32,7 @@ IDLE_S = 1.0
 
 @dataclass(frozen=True, slots=True)
 class Topics:
-    """ROS names of the topics.
+    """ROS names of the topics. An empty name: there is no such topic.
 
     Attributes:
         color: RGB images, input.
@@ -37,6 +40,7 @@ class Topics:
         info: calibration of the RGB camera, input.
         pose: poses, output.
         diagnostics: diagnoses, output.
+        right_info: calibration of the stereo rig's right camera, input.
     """
 
     color: str = "/camera/color/image_raw"
@@ -44,6 +48,7 @@ class Topics:
     info: str = "/camera/color/camera_info"
     pose: str = "/initialpose"
     diagnostics: str = "/diagnostics"
+    right_info: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,7 +74,8 @@ class Bridge:
         localize: answers a query; a ``StreetfixError`` becomes a diagnosis.
         topics: named in messages.
         policy: query rate, and which answers are published.
-        pairs: received messages.
+        pairs: received images and calibrations.
+        robot: what is known beside the images.
         T_vehicle_camera: from the camera frame to the vehicle frame, metres.
         frame_id: of the map.
         rectified: see ``camera_from``. The name of the colour topic can say the same.
@@ -81,12 +87,23 @@ class Bridge:
     topics: Topics = field(default_factory=Topics)
     policy: PublishPolicy = field(default_factory=PublishPolicy)
     pairs: Pairs = field(default_factory=Pairs)
+    robot: Robot = field(default_factory=Robot)
     T_vehicle_camera: Transform = field(default_factory=CAMERA_AS_BODY.copy)
     frame_id: str = "map"
     rectified: bool = False
     clock: Callable[[], float] = time.monotonic
     counts: Counts = field(default_factory=Counts)
     _recent_s: deque[float] = field(default_factory=lambda: deque(maxlen=_RECENT))
+
+    def handlers(self) -> dict[str, Callable[[Any], None]]:
+        """Return the functions that take messages, by the topic to subscribe to (attribute of ``Topics``)."""
+        all_handlers: dict[str, Callable[[Any], None]] = {
+            "color": self.pairs.color,
+            "depth": self.pairs.depth,
+            "info": self.pairs.info,
+        }
+        all_handlers |= self.robot.handlers()
+        return {name: handler for name, handler in all_handlers.items() if getattr(self.topics, name)}
 
     def wait_s(self) -> float:
         """Return the seconds until the next query is due. Until then messages need not be read."""
@@ -97,7 +114,7 @@ class Bridge:
 
         Without a rate limit it takes the oldest pair, so that every pair has its turn. It blocks until the answer arrives.
         """
-        if self.wait_s() > 0:
+        if self.wait_s() > 0 or self.robot.missing():
             return None
         pair = self.pairs.newest() if self.policy.rate_hz else self.pairs.oldest()
         return None if pair is None else self._ask(pair)
@@ -108,7 +125,7 @@ class Bridge:
 
     def idle(self) -> Diagnosis:
         """Build the diagnosis for a time without image pairs."""
-        missing = self.pairs.missing()
+        missing = (*self.pairs.missing(), *self.robot.missing())
         if missing:
             listed = ", ".join(f"{name} ({getattr(self.topics, name)})" for name in missing)
             message = f"no messages on {listed}; check that the topics have publishers"
@@ -125,7 +142,7 @@ class Bridge:
             rectified = self.rectified or is_rectified_by_name(self.topics.color)
             camera = camera_from(pair.info, self.topics.info, rectified=rectified)
             rgb, depth_m = rgb_from(pair.color, self.topics.color), depth_from(pair.depth, self.topics.depth)
-            answer = self.localize(rgb, depth_m, camera)
+            answer = self.localize(rgb, depth_m, camera, self.robot.known())
         except StreetfixError as error:
             self.counts.failed += 1
             return Published(None, Diagnosis(stamp_ns, Level.ERROR, error.message, self._counted()), None)

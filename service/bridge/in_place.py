@@ -6,12 +6,12 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from service.bridge.known import Known
 from service.contract.convert import answer_from, require_camera
 from service.contract.schema import LocalizeAnswer
 from service.geometry.camera import PinholeCamera
 from service.imaging.decode import require_sizes
 from service.imaging.depth_units import depth_from_values
-from service.imaging.level import GivenHeight
 from service.retrieval.query import Query
 from service.runtime.engine import Located
 from service.runtime.map_registry import MapRegistry
@@ -23,24 +23,25 @@ class InPlace:
 
     Args:
         bundle: folder of the map bundle.
-        camera_height: height of the camera above the ground; None: it is found in the depth image.
 
     Raises:
         BundleError: the bundle is missing or damaged.
     """
 
-    def __init__(self, bundle: Path, camera_height: GivenHeight | None = None) -> None:
+    def __init__(self, bundle: Path) -> None:
         limit_pools()
-        self._camera_height = camera_height
         self._localizer = MapRegistry.open((bundle,)).get(None)
 
-    def __call__(self, rgb: NDArray[np.uint8], depth_m: NDArray[np.float32], camera: PinholeCamera) -> LocalizeAnswer:
+    def __call__(
+        self, rgb: NDArray[np.uint8], depth_m: NDArray[np.float32], camera: PinholeCamera, known: Known
+    ) -> LocalizeAnswer:
         """Localize an image pair, like ``Client.localize``.
 
         Args:
             rgb: sRGB image, (H, W, 3).
             depth_m: z along the optical axis, metres, (H, W).
             camera: intrinsics and distortion of both images.
+            known: facts beside the images.
 
         Raises:
             RequestError: the intrinsics or the distortion are invalid, an image does not fit them, or the depth image holds no depth.
@@ -48,6 +49,7 @@ class InPlace:
         require_camera(camera)
         z_m = depth_from_values(depth_m, scale_m=1.0, kind="z", camera=camera, baseline_m=None, max_range_m=None)
         require_sizes(rgb, z_m, camera)
-        query = replace(Query.of_images(rgb, z_m, camera), camera_height=self._camera_height)
+        pair = Query.of_images(rgb, z_m, camera, baseline_m=known.baseline_m)
+        query = replace(pair, camera_height=known.camera_height)
         answer = self._localizer.localize(query)
         return answer_from(Located(answer, self._localizer.bundle))

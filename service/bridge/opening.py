@@ -8,9 +8,10 @@ from service.bridge.bridge import Bridge, Localize, Topics
 from service.bridge.pairs import Pairs
 from service.bridge.pose import CAMERA_AS_BODY, height_from, mount_from
 from service.bridge.publish_policy import PublishPolicy
+from service.bridge.rig import StereoRig
+from service.bridge.robot import Robot
 from service.bridge.settings import BridgeSettings
 from service.errors import RequestError
-from service.imaging.level import GivenHeight
 from service.runtime.wakeup import Wakeup
 
 #: Limits of a query. After a longer time the robot has left the place of the images.
@@ -29,8 +30,14 @@ def opened(settings: BridgeSettings) -> Iterator[Bridge]:
         BundleError: the map bundle is missing or damaged.
         KeysError: a file of ``ca``, ``cert`` or ``key`` cannot be used.
     """
+    rig = StereoRig(settings.baseline_m, settings.right_info_topic or "")
     topics = Topics(
-        settings.color_topic, settings.depth_topic, settings.info_topic, settings.pose_topic, settings.diagnostics_topic
+        settings.color_topic,
+        settings.depth_topic,
+        settings.info_topic,
+        settings.pose_topic,
+        settings.diagnostics_topic,
+        right_info=rig.topic,
     )
     policy, pairs = PublishPolicy(settings.rate, settings.min_confidence), Pairs(tolerance_s=settings.tolerance)
     mount = None if settings.mount is None else mount_from(settings.mount)
@@ -40,12 +47,13 @@ def opened(settings: BridgeSettings) -> Iterator[Bridge]:
             f"--queue: {settings.queue} is not a valid number of images; give 1 or more, or 0 to keep all",
             field="queue",
         )
-    with _asking(settings, height) as localize:
+    with _asking(settings) as localize:
         yield Bridge(
             localize=localize,
             topics=topics,
             policy=policy,
             pairs=pairs,
+            robot=Robot(rig=rig, camera_height=height),
             T_vehicle_camera=CAMERA_AS_BODY if mount is None else mount,
             frame_id=settings.frame,
             rectified=settings.rectified,
@@ -53,7 +61,7 @@ def opened(settings: BridgeSettings) -> Iterator[Bridge]:
 
 
 @contextmanager
-def _asking(settings: BridgeSettings, height: GivenHeight | None = None) -> Iterator[Localize]:
+def _asking(settings: BridgeSettings) -> Iterator[Localize]:
     """Provide the function that localizes: by a service, or by the map in this process."""
     if settings.map is not None:
         if given := next((name for name in ("ca", "cert", "key") if getattr(settings, name) is not None), None):
@@ -70,24 +78,21 @@ def _asking(settings: BridgeSettings, height: GivenHeight | None = None) -> Iter
         limit_pools_before_import()
         from service.bridge.in_place import InPlace
 
-        yield InPlace(settings.map, height)
+        yield InPlace(settings.map)
         return
+    from service.bridge.asking import AskService
     from service.client import Client, RetryPolicy
 
-    patience, name = RetryPolicy(attempts=_ATTEMPTS, total_s=_PATIENCE_S), settings.map_name
     with Client(
         settings.url,
         api_key=settings.api_key,
         timeout_s=_TIMEOUT_S,
-        retry=patience,
+        retry=RetryPolicy(attempts=_ATTEMPTS, total_s=_PATIENCE_S),
         ca=settings.ca,
         cert=settings.cert,
         key=settings.key,
     ) as client:
-        height_m, std_m = (None, None) if height is None else (height.height_m, height.std_m)
-        yield lambda rgb, depth_m, camera: client.localize(
-            rgb, depth_m, camera, map=name, camera_height_m=height_m, camera_height_std_m=std_m
-        )
+        yield AskService(client, settings.map_name)
 
 
 @contextmanager

@@ -111,10 +111,10 @@ def spin(
         history=HistoryPolicy.KEEP_LAST if depth else HistoryPolicy.KEEP_ALL,
         reliability=ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT,
     )
-    topics, pairs = bridge.topics, bridge.pairs
-    node.create_subscription(Image, topics.color, pairs.color, pictures)
-    node.create_subscription(Image, topics.depth, pairs.depth, pictures)
-    node.create_subscription(CameraInfo, topics.info, pairs.info, pictures)
+    topics = bridge.topics
+    kinds = {"color": Image, "depth": Image, "info": CameraInfo, "right_info": CameraInfo}
+    for name, handler in bridge.handlers().items():
+        node.create_subscription(kinds[name], getattr(topics, name), handler, pictures)
     poses = node.create_publisher(PoseWithCovarianceStamped, topics.pose, 10)
     diagnoses = node.create_publisher(DiagnosticArray, topics.diagnostics, 10)
     spoken_s = bridge.clock()

@@ -23,6 +23,13 @@ from service.runtime.wakeup import Wakeup
 M = TypeVar("M", bound=IdlStruct)
 #: Maximum seconds until a signal is noticed.
 _LOOK_S = 0.2
+#: Message types of the input topics, by the attribute of ``Topics``.
+_KINDS: dict[str, type[IdlStruct]] = {
+    "color": messages.Image,
+    "depth": messages.Image,
+    "info": messages.CameraInfo,
+    "right_info": messages.CameraInfo,
+}
 #: Data representation of ROS 2 on the wire.
 _CDR = Policy.DataRepresentation(use_cdrv0_representation=True)
 
@@ -68,13 +75,13 @@ class DdsNode:
         try:
             self._participant = DomainParticipant(domain)
             pictures = qos_of(reliable=reliable, depth=depth)
-            self._color = self._reader(topics.color, messages.Image, pictures)
-            self._depth = self._reader(topics.depth, messages.Image, pictures)
-            self._info = self._reader(topics.info, messages.CameraInfo, pictures)
+            self._readers = {
+                name: self._reader(getattr(topics, name), _KINDS[name], pictures) for name in bridge.handlers()
+            }
             self._pose = self._writer(topics.pose, messages.PoseWithCovarianceStamped)
             self._diagnostics = self._writer(topics.diagnostics, messages.DiagnosticArray)
             self._waiting = WaitSet(self._participant)
-            for reader in (self._color, self._depth, self._info):
+            for reader in self._readers.values():
                 unread = ReadCondition(reader, SampleState.Any | ViewState.Any | InstanceState.Any)
                 self._waiting.attach(unread)
         except DDSException as error:
@@ -106,13 +113,10 @@ class DdsNode:
                 spoken_s = time.monotonic()
 
     def _take(self) -> None:
-        pairs = self._bridge.pairs
-        for info in self._info.take(N=pairs.most):
-            pairs.info(info)
-        for color in self._color.take(N=pairs.most):
-            pairs.color(color)
-        for depth in self._depth.take(N=pairs.most):
-            pairs.depth(depth)
+        handlers = self._bridge.handlers()
+        for name, reader in self._readers.items():
+            for message in reader.take(N=self._bridge.pairs.most):
+                handlers[name](message)
 
     def _publish(self, published: Published) -> None:
         if published.pose is not None:

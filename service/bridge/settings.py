@@ -34,6 +34,8 @@ class BridgeSettings:
         base_on_ground: see ``height_from``.
         camera_height_m: see ``height_from``.
         rectified: see ``camera_from``.
+        baseline_m: see ``StereoRig``, metres.
+        right_info_topic: see ``StereoRig``.
         rate: see ``PublishPolicy``, Hz.
         min_confidence: see ``PublishPolicy``.
         tolerance: see ``Pairs``, seconds.
@@ -77,6 +79,14 @@ class BridgeSettings:
         "The images are rectified, whatever lens the CameraInfo describes. A colour topic whose name says rect counts as rectified too. "
         "The service rectifies other images.",
     ] = False
+    baseline_m: Annotated[
+        float,
+        "Baseline of the stereo rig that measures the depth, metres. 0: from --right-info-topic, otherwise no rig is known.",
+    ] = 0.0
+    right_info_topic: Annotated[
+        str | None,
+        "sensor_msgs/CameraInfo of the rig's rectified right camera. Its P[0, 3] gives the baseline, unless --baseline-m does.",
+    ] = None
     rate: Annotated[float, "Largest number of queries per second. 0 sends one for every pair."] = 1.0
     min_confidence: Annotated[float, "Smallest confidence of a published pose. 0 passes every LOCALIZED answer."] = 0.9
     tolerance: Annotated[float, "Largest difference between the stamps of colour and depth, seconds."] = 0.02

@@ -13,6 +13,7 @@ from service.geometry.camera import DistortionModel
 from service.geometry.distortion import COEFFICIENTS, LIMITS, coefficient_problem
 from service.option_limits import (
     HEIGHT_STD_M,
+    LEAST_BASELINE_M,
     LEAST_FALSE_ACCEPT_RATE,
     LEAST_HEIGHT_M,
     LEAST_HEIGHT_STD_M,
@@ -20,6 +21,7 @@ from service.option_limits import (
     LEAST_ODOMETRY_STD_M,
     LEAST_SIDE,
     MOST_ASPECT,
+    MOST_BASELINE_M,
     MOST_HEIGHT_M,
     MOST_HEIGHT_STD_M,
     MOST_NEIGHBOURS,
@@ -221,8 +223,8 @@ class Depth(_Strict):
     )
     baseline_m: float | None = Field(
         None,
-        ge=1e-3,
-        le=100,
+        ge=LEAST_BASELINE_M,
+        le=MOST_BASELINE_M,
         description="baseline of the stereo rig. Disparity needs it. "
         "With a baseline, the service also estimates the rig's disparity offset",
     )

@@ -4,9 +4,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from service.bridge.bridge import IDLE_S, Bridge, line_of
+from service.bridge.bridge import IDLE_S, Bridge, Topics, line_of
 from service.bridge.diagnostics import Level
 from service.bridge.publish_policy import PublishPolicy
+from service.bridge.rig import StereoRig
+from service.bridge.robot import Robot as OfRobot
 from service.contract.schema import LocalizeAnswer
 from service.errors import RequestError, UnreachableError
 
@@ -54,10 +56,11 @@ def test_a_sure_answer_is_a_pose_with_the_pictures_stamp(robot: Robot) -> None:
     assert published.pose is not None
     assert (published.pose.stamp_ns, published.pose.frame_id) == (5 * S, "world")
     assert published.diagnosis.level == Level.OK
-    (rgb, depth_m, camera), *_ = robot.asked
+    ((rgb, depth_m, camera, known),) = robot.asked
     np.testing.assert_array_equal(rgb, RGB)
     np.testing.assert_allclose(depth_m, 2.5)
     assert camera.fx == 3.0
+    assert (known.baseline_m, known.camera_height) == (None, None)
 
 
 def test_diagnoses_carry_what_an_operator_looks_for(robot: Robot) -> None:
@@ -173,6 +176,32 @@ def test_silence_names_the_topics_that_bring_nothing(robot: Robot, info_of: Make
     bridge.pairs.color(image_of(RGB, "rgb8", 0))
     bridge.pairs.depth(image_of(DEPTH, "16UC1", S))
     assert "--tolerance" in bridge.idle().message
+
+
+def test_no_query_is_sent_before_the_right_cameras_calibration_is_there(robot: Robot, info_of: Make) -> None:
+    rig = StereoRig(topic="/right")
+    bridge = robot.bridge(topics=Topics(right_info="/right"), robot=OfRobot(rig=rig))
+    robot.see(bridge, 1 * S)
+    assert bridge.step() is None
+    assert "no messages on right_info (/right); check" in bridge.idle().message
+    bridge.handlers()["right_info"](info_of(p=[500.0, 0, 0, -60.0, 0, 500.0, 0, 0, 0, 0, 1, 0]))
+    assert bridge.step() is not None
+    ((*_, known),) = robot.asked
+    assert known.baseline_m == 0.12
+
+
+def test_a_calibration_that_is_not_of_a_right_camera_is_reported(robot: Robot, info_of: Make) -> None:
+    bridge = robot.bridge(topics=Topics(right_info="/right"), robot=OfRobot(rig=StereoRig(topic="/right")))
+    robot.see(bridge, 1 * S)
+    bridge.handlers()["right_info"](info_of())
+    published = bridge.step()
+    assert published is not None
+    assert (published.diagnosis.level, robot.asked) == (Level.ERROR, [])
+    assert published.diagnosis.message.startswith("/right: its P[0, 3] of 0 and fx of 0 px mean a baseline of 0 m")
+
+
+def test_only_topics_with_a_name_have_a_handler(robot: Robot) -> None:
+    assert list(robot.bridge().handlers()) == ["color", "depth", "info"]
 
 
 def test_lines_for_people(robot: Robot, answer_of: Answer) -> None:

@@ -5,9 +5,11 @@ from typing import Any
 import pytest
 
 from service.bridge.in_place import InPlace
+from service.bridge.known import Known
 from service.errors import RequestError
 from service.geometry.camera import PinholeCamera
 from service.imaging.level import GivenHeight
+from service.retrieval.query import Query
 
 
 @pytest.mark.parametrize(
@@ -22,15 +24,15 @@ def test_a_camera_beyond_the_contracts_bounds_is_refused_without_a_service_too(
 ) -> None:
     rgb, depth_m, good = pictures
     localize = InPlace(bundle_path)
-    assert localize(rgb, depth_m, good).map.name == "tiny"
+    assert localize(rgb, depth_m, good, Known()).map.name == "tiny"
     with pytest.raises(RequestError) as caught:
-        localize(rgb, depth_m, camera)
+        localize(rgb, depth_m, camera, Known())
     assert caught.value.field == field
 
 
 def test_a_camera_height_that_is_given_counts_without_a_service_too(bundle_path: Path, pictures: Any) -> None:
     for given, origin in ((None, "estimated"), (GivenHeight(1.52, 0.02), "given")):
-        answer = InPlace(bundle_path, given)(*pictures)
+        answer = InPlace(bundle_path)(*(*pictures, Known(camera_height=given)))
         assert answer.camera_height is not None
         assert (answer.camera_height.origin, round(answer.camera_height.height_m, 1)) == (origin, 1.5)
 
@@ -39,7 +41,7 @@ def test_a_lens_is_rectified_without_a_service_too(bundle_path: Path, pictures: 
     lens = PinholeCamera(128, 96, 80.0, 80.0, 63.5, 47.5, (0.01, 0.0, 0.0, 0.0), "kannala_brandt")
     localize = InPlace(bundle_path)
     rgb, depth_m = pictures_through(lens)
-    plain, bent = localize(*pictures), localize(rgb, depth_m, lens)
+    plain, bent = localize(*(*pictures, Known())), localize(rgb, depth_m, lens, Known())
     assert bent.pose is not None
     assert plain.pose is not None
     for axis in "xyz":
@@ -54,5 +56,22 @@ def test_a_lens_beyond_the_contracts_bounds_is_refused_without_a_service_too(bun
         ((-0.3, 0.0, 0.0, 0.0), "stops"),
     ):
         with pytest.raises(RequestError, match=why) as caught:
-            InPlace(bundle_path)(rgb, depth_m, replace(camera, distortion=distortion))
+            InPlace(bundle_path)(rgb, depth_m, replace(camera, distortion=distortion), Known())
         assert caught.value.field == "camera.distortion"
+
+
+def test_a_baseline_reaches_the_query_without_a_service_too(
+    bundle_path: Path, pictures: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked = list[Query]()
+    localize = InPlace(bundle_path)
+    answered = localize._localizer.localize
+
+    def keep(query: Query) -> Any:
+        asked.append(query)
+        return answered(query)
+
+    monkeypatch.setattr(localize._localizer, "localize", keep)
+    for known in (Known(), Known(baseline_m=0.12)):
+        localize(*(*pictures, known))
+    assert [query.baseline_m for query in asked] == [None, 0.12]

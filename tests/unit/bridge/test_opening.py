@@ -3,6 +3,7 @@
 import signal
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -15,6 +16,13 @@ from service.client import Client
 from service.errors import RequestError
 from service.geometry.camera import PinholeCamera
 
+#: Colour, depth and camera of an image pair.
+PICTURES = (
+    np.zeros((4, 6, 3), np.uint8),
+    np.ones((4, 6), np.float32),
+    PinholeCamera(6, 4, 3.0, 3.0, 2.5, 1.5),
+)
+
 
 def test_every_setting_reaches_the_bridge() -> None:
     settings = BridgeSettings(
@@ -26,12 +34,13 @@ def test_every_setting_reaches_the_bridge() -> None:
         frame="earth",
         mount="1,2,3,0,0,0,1",
         rectified=True,
+        right_info_topic="/r",
         rate=0.5,
         min_confidence=0.25,
         tolerance=0.125,
     )
     with opened(settings) as bridge:
-        assert bridge.topics == Topics("/c", "/d", "/i", "/p", "/g")
+        assert bridge.topics == Topics("/c", "/d", "/i", "/p", "/g", right_info="/r")
         assert (bridge.frame_id, bridge.rectified) == ("earth", True)
         assert (bridge.policy.rate_hz, bridge.policy.min_confidence) == (0.5, 0.25)
         assert bridge.pairs._tolerance_ns == 125_000_000
@@ -58,6 +67,8 @@ def test_a_map_answers_without_a_service(bundle_path: Path) -> None:
         ({"queue": -1}, "--queue: -1 is not a valid number of images; give 1 or more, or 0 to keep all"),
         ({"url": "nowhere"}, "url: 'nowhere' is not a URL"),
         ({"camera_height_m": 40.0}, "--camera-height-m: 40 m is not a valid camera height; give 0.05 to 30 m"),
+        ({"baseline_m": 0.0005}, "--baseline-m: 0.0005 m is not a valid baseline; give 0.001 to 100 m, or 0 if"),
+        ({"baseline_m": -0.12}, "--baseline-m: -0.12 m is not a valid baseline"),
         ({"base_on_ground": True}, "--base-on-ground: .* give --mount, or --camera-height-m"),
         ({"base_on_ground": True, "mount": "0,0,0,0,0,0,1"}, "--mount: with --base-on-ground, its Z of 0 m"),
         ({"map": Path("m"), "map_name": "n"}, "--map gives one map"),
@@ -96,8 +107,27 @@ def test_the_camera_height_of_the_settings_is_sent(
     monkeypatch.setattr(Client, "localize", lambda *_, **about: asked.append(about))
     settings = replace(BridgeSettings(mount="0.1,0,0.42,-0.5,0.5,-0.5,0.5"), **changed)  # type: ignore[arg-type]
     with opened(settings) as bridge:
-        bridge.localize(
-            np.zeros((4, 6, 3), np.uint8), np.ones((4, 6), np.float32), PinholeCamera(6, 4, 3.0, 3.0, 2.5, 1.5)
-        )
-    unsaid = {"map": None, "camera_height_m": None, "camera_height_std_m": None}
-    assert asked == [unsaid | height]
+        bridge.localize(*PICTURES, bridge.robot.known())
+    assert asked == [{"map": None} | height]
+
+
+@pytest.mark.parametrize(
+    ("changed", "topic", "sent"),
+    [
+        ({}, "", {}),
+        ({"baseline_m": 0.12}, "", {"baseline_m": 0.12}),
+        ({"right_info_topic": "/right"}, "/right", {"baseline_m": 0.5}),
+        ({"right_info_topic": "/right", "baseline_m": 0.12}, "", {"baseline_m": 0.12}),
+    ],
+)
+def test_the_baseline_of_the_settings_or_of_the_right_camera_is_sent(
+    monkeypatch: pytest.MonkeyPatch, info_of: Any, changed: dict[str, object], topic: str, sent: dict[str, float]
+) -> None:
+    asked: list[dict[str, object]] = []
+    monkeypatch.setattr(Client, "localize", lambda *_, **about: asked.append(about))
+    with opened(replace(BridgeSettings(), **changed)) as bridge:  # type: ignore[arg-type]
+        assert bridge.topics.right_info == topic
+        if topic:
+            bridge.handlers()["right_info"](info_of(p=[400.0, 0, 0, -200.0, 0, 400.0, 0, 0, 0, 0, 1, 0]))
+        bridge.localize(*PICTURES, bridge.robot.known())
+    assert asked == [{"map": None} | sent]

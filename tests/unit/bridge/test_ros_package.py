@@ -16,6 +16,7 @@ import pytest
 import yaml
 
 from service.bridge import in_place
+from service.bridge.known import Known
 from service.bridge.settings import about, parameters
 from service.contract.schema import LocalizeAnswer
 from service.imaging.level import GivenHeight
@@ -141,12 +142,16 @@ def test_the_node_answers_images_until_a_signal(
     info_of: Callable[..., Any],
     answer_of: Callable[..., LocalizeAnswer],
 ) -> None:
-    opened, heights = list[Path](), list[GivenHeight | None]()
+    opened, asked = list[Path](), list[Known]()
 
-    def of(bundle: Path, height: GivenHeight | None) -> Callable[..., LocalizeAnswer]:
+    def of(bundle: Path) -> Callable[..., LocalizeAnswer]:
         opened.append(bundle)
-        heights.append(height)
-        return lambda *_: answer_of()
+
+        def answer(*given: Any) -> LocalizeAnswer:
+            asked.append(given[-1])
+            return answer_of()
+
+        return answer
 
     monkeypatch.setattr(in_place, "InPlace", of)
     ros.given = {
@@ -156,19 +161,22 @@ def test_the_node_answers_images_until_a_signal(
         "mount": "0,0,0,-0.5,0.5,-0.5,0.5",
         "base_on_ground": True,
         "camera_height_m": 0.3,
+        "right_info_topic": "/right/camera_info",
         "reliable": True,
         "queue": 0,
     }
 
     def see() -> None:
         ros.subscriptions["/camera/color/camera_info"].heard(info_of(0))
+        ros.subscriptions["/right/camera_info"].heard(info_of(p=[400.0, 0, 0, -48.0, 0, 400.0, 0, 0, 0, 0, 1, 0]))
         color, depth = np.zeros((4, 6, 3), np.uint8), np.ones((4, 6), np.float32)
         ros.subscriptions["/camera/color/image_raw"].heard(image_of(color, "rgb8", 5 * S))
         ros.subscriptions["/camera/aligned_depth_to_color/image_raw"].heard(image_of(depth, "32FC1", 5 * S))
 
     ros.turns, ros.no_more = [see], lambda: signal.raise_signal(signal.SIGINT)
     assert node["main"](["--ros-args"]) == 0
-    assert (opened, heights) == ([Path("maps/site")], [GivenHeight(0.3, 0.05)])
+    assert opened == [Path("maps/site")]
+    assert [(known.camera_height, known.baseline_m) for known in asked] == [(GivenHeight(0.3, 0.05), 0.12)]
     (pose,) = ros.published["/pose"]
     assert (pose.header.frame_id, pose.pose.pose.position.x) == ("earth", 10.0)
     assert {(each.qos.reliability, each.qos.history) for each in ros.subscriptions.values()} == {("reliable", "all")}

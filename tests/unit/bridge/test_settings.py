@@ -50,6 +50,7 @@ def test_a_parameter_has_the_type_of_its_setting_and_an_empty_text_for_none() ->
         "cert",
         "key",
         "mount",
+        "right_info_topic",
     ]
     assert (declared["rate"], declared["rectified"], declared["queue"]) == (1.0, False, 5)
 
