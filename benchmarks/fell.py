@@ -176,8 +176,8 @@ def _fell(row: Mapping[str, Any], then: float, interval: tuple[float, float] | N
         return _outside(now) > max(_outside(then), 0.0)
     lower = _lower_is_better(row)
     if interval is not None:
-        return then < interval[0] if lower else then > interval[1]
-    return now > then if lower else now < then
+        return bool(then < interval[0] if lower else then > interval[1])
+    return bool(now > then if lower else now < then)
 
 
 def _outside(share: float) -> float:

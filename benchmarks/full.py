@@ -16,6 +16,7 @@ from model_training.evaluation.pose_errors import pose_errors
 from model_training.evaluation.predict import Predictions, headings_of, joined
 from service.geometry.rigid import heading_of_camera
 
+
 def full_paper_rows(report: Report, runs: Runs) -> None:
     """Add the rows of the paper's city: five other traversals with Table I's counts.
 

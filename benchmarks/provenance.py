@@ -87,6 +87,12 @@ _SEARCH = (
     *("service/maps/index.py", "service/maps/inverted_file.py", "service/retrieval", "service/imaging"),
     "model_training/stock/encoder.onnx",
 )
+#: Rows of real drives for which a calibration is made.
+_OF_CALIBRATED = (
+    "real.calibrated_on_0005.",
+    "real.ece_after_rig_calibration",
+    *(f"real.kitti_{drive}.ece_after_rig_calibration" for drive in ("0005", "0013")),
+)
 #: Paths that the rows of each report measure, by the beginning of their ids. The longest match counts; "" matches all
 #: other rows. The benchmark programs are left out: a row is as old as the code that it measures.
 MEASURED: dict[str, dict[str, tuple[str, ...]]] = {

@@ -176,9 +176,13 @@ def tiled_search(
 def _map_of(numbers: DrawnViews, search: PlaceSearch | None, tiles: DrawnTiles) -> TiledMap:
     """Return the map of some tiles. It has nothing that a search does not read."""
     grid, sizes = ViewGrid(), np.diff(tiles.first_view).tolist()
+    # only the two fields that a search reads
+    counts: Any = {"views": len(numbers)}
+    given: dict[str, Any] = {"headings": HEADINGS, "counts": Counts.model_construct(**counts)}
+    read = Manifest.model_construct(**given)
     return TiledMap(
         path=Path(),
-        manifest=Manifest.model_construct(headings=HEADINGS, counts=Counts.model_construct(views=len(numbers))),
+        manifest=read,
         grid=grid,
         rows_seen=np.ones(grid.rows, np.bool_),
         places=np.empty(0, PLACE),

@@ -698,7 +698,8 @@ def expected_next(
     beside_m = _away_m(squares_m[rows], xy_m + EXPECT_M * direction)
     order = np.lexsort((np.where(is_crossed, enters_m, beside_m), ~is_crossed))
     wanted = is_crossed | (away_m[rows] <= EXPECT_M)
-    return rows[order[wanted[order]]][:MOST_EXPECTED]
+    expected: NDArray[np.int64] = rows[order[wanted[order]]][:MOST_EXPECTED]
+    return expected
 
 
 def in_order(numbers: Int64[NDArray[np.int64], " n"]) -> Int64[NDArray[np.int64], " m"]:

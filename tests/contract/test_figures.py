@@ -84,7 +84,9 @@ def test_what_is_typed_is_found() -> None:
 
 
 def test_figures_take_their_value_from_reports_and_code(tmp_path, monkeypatch) -> None:
-    (tmp_path / "speed.json").write_text('{"rows": [{"id": "a.b", "value": 40.6, "n": 7}, {"id": "none", "value": null}]}')
+    (tmp_path / "speed.json").write_text(
+        '{"rows": [{"id": "a.b", "value": 40.6, "n": 7}, {"id": "none", "value": null}]}'
+    )
     monkeypatch.setattr(figures, "REPORTS", tmp_path)
     monkeypatch.setitem(CODE, "rate", lambda: 0.025)
     text = "x <!-- figure: speed a.b .0f -->?<!-- /figure --> y <!-- figure: code rate .1% -->0<!-- /figure -->"

@@ -1,6 +1,7 @@
 """Errors of camera heights: estimated by the service, and given by the caller."""
 
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -40,19 +41,24 @@ class Flat:
         )
 
 
+def flat(height_m, **more) -> Any:
+    """Return a ``Flat`` in place of a dataset."""
+    return Flat(height_m, **more)
+
+
 def test_an_estimated_height_is_that_of_the_ground_in_the_image():
-    assert height_errors(Flat(0.8), ("level",)) == pytest.approx([0.0], abs=0.02)
+    assert height_errors(flat(0.8), ("level",)) == pytest.approx([0.0], abs=0.02)
 
 
 def test_without_ground_a_given_height_counts_and_else_the_usual_one():
     """The camera is 0.8 m high. The usual height is 1.5 m, and the caller says 0.9 m."""
-    assert height_errors(Flat(0.8, ground=False), ("level",)) == pytest.approx([0.7])
-    assert height_errors(Flat(0.8, ground=False), ("level",), told_m=0.9) == pytest.approx([0.1])
+    assert height_errors(flat(0.8, ground=False), ("level",)) == pytest.approx([0.7])
+    assert height_errors(flat(0.8, ground=False), ("level",), told_m=0.9) == pytest.approx([0.1])
 
 
 def test_a_query_without_a_true_pose_is_refused():
     with pytest.raises(DatasetError, match="flat: a query has no true pose"):
-        height_errors(Flat(0.8, truth=False), ("level",))
+        height_errors(flat(0.8, truth=False), ("level",))
 
 
 def test_the_bar_counts_for_estimated_and_given_heights(tmp_path):

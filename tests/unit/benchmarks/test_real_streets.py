@@ -3,6 +3,7 @@
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -251,9 +252,8 @@ def test_all_recordings_take_part_in_the_pooled_error(tmp_path, monkeypatch, ans
         "kitti_0013": answers_of(*two, status=["LOCALIZED", "AMBIGUOUS"]),
         "frames": answers_of(*one),
     }
-    made = {
-        name: streets.Street(name, SimpleNamespace(name=name), SimpleNamespace(name=name)) for name in streets.DRIVES
-    }
+    stand_in: dict[str, Any] = {name: SimpleNamespace(name=name) for name in streets.DRIVES}
+    made = {name: streets.Street(name, each, each) for name, each in stand_in.items()}
     drive = judged("d", inside=[(0.9, True)] * 2, outside=[0.1] * 2)
     monkeypatch.setattr(streets, "_street", lambda _report, _data, _work, name: made[name])
     monkeypatch.setattr(streets, "predict", lambda _localizer, dataset, _queries: answers[dataset.name])

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from benchmarks.report import Report
-from benchmarks.scale import search, tiled, town
+from benchmarks.scale import growth, search, tiled, town
 from benchmarks.scale.built import APART_M, copied
 from benchmarks.scale.drawn import Asked, DrawnViews, _step
 from benchmarks.scale.sources import HEADINGS, RealDescriptors

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 
+from service.localization.localizer import Localizer
 from service.maps import files
 from service.maps.content import BundleContent
 from service.maps.manifest import TILES_FOLDER, Manifest
@@ -149,9 +150,12 @@ def test_tiles_are_opened_ahead_after_the_warm_up(write: Write, tmp_path: Path) 
     """The warm-up is a random query, and nobody drives there."""
     write("v1", [1, 2])
     registry, seen = MapRegistry(), []
-    watcher = MapWatcher(
-        registry, [tmp_path / "maps"], warm=lambda localizer: seen.append(localizer.bundle.tiles.opens_ahead)
-    )
+
+    def warm(localizer: Localizer) -> None:
+        assert isinstance(localizer.bundle, TiledMap)
+        seen.append(localizer.bundle.tiles.opens_ahead)
+
+    watcher = MapWatcher(registry, [tmp_path / "maps"], warm=warm)
     watcher.open_first()
     assert seen == [False]
     opened = registry.get("town").bundle
