@@ -9,6 +9,7 @@ from typing import Any
 import pytest
 import yaml
 
+from service.client.cells import HEADER
 from service.runtime.settings import Settings
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -89,6 +90,17 @@ def test_helm_finds_nothing_to_complain_of() -> None:
 
 BASE = ["--set", "image.repository=registry.example/streetfix,maps.claim=maps"]
 KEYS = ["--set", "keys.secret=keys"]
+VERSION = "3f9c2a7be01d4586"
+STORED = [
+    *("--set", "image.repository=registry.example/streetfix", *KEYS),
+    *(
+        "--set",
+        f"maps.urls={{s3://bucket/maps/town@{VERSION},gs://bucket/city}}",
+        "--set",
+        "network.store[0]=10.1.0.0/16",
+    ),
+]
+ROUTING = ["--set", "routing.enabled=true,routing.host=maps.example"]
 
 
 def rendered(*options: str) -> "subprocess.CompletedProcess[str]":
@@ -130,6 +142,24 @@ def test_what_it_renders_is_what_kubernetes_reads(options: list[str]) -> None:
         (BASE, "keys.secret"),
         ([*BASE, "--set", "tls.clientCa=ca"], "tls.clientCa needs tls.secret"),
         ([*BASE, *KEYS, "--set", "monitor.enabled=true"], "monitor.secret"),
+        ([*BASE, *KEYS, "--set", "spread.zones=Never"], 'spread: "Never" is not known; write ScheduleAnyway or'),
+        ([*BASE, *KEYS, "--set", "spread.machines=true"], "spread: "),
+        ([*STORED, "--set", "network.store=null"], "network.store"),
+        (
+            [*STORED, "--set", "maps.cache.hostPath=/c,maps.cache.storageClass=nvme"],
+            "storageClass and hostPath exclude",
+        ),
+        ([*BASE, *KEYS, *ROUTING], "routing.gateway.name"),
+        ([*BASE, *KEYS, "--set", "routing.enabled=true,routing.gateway.name=eg"], "routing.host"),
+        ([*BASE, *KEYS, *ROUTING, "--set", "routing.controller=traefik"], 'routing.controller: "traefik" is not known'),
+        (
+            [*BASE, *KEYS, *ROUTING, "--set", "routing.gateway.name=eg,tls.secret=tls"],
+            "leave tls.secret and routing.tls",
+        ),
+        (
+            [*BASE, *ROUTING, "--set", "tls.secret=tls,tls.clientCa=ca,routing.controller=nginx"],
+            "leave tls.clientCa empty",
+        ),
     ],
 )
 def test_what_is_missing_is_told_by_its_name(options: list[str], told: str) -> None:
@@ -179,6 +209,158 @@ def test_pods_are_placed_and_named_as_the_values_say() -> None:
 def test_the_service_names_the_protocol_that_is_spoken(tls: bool, protocols: list[str]) -> None:
     found = documents(*BASE, *KEYS, *(["--set", "tls.secret=tls"] if tls else []))
     assert [port["appProtocol"] for port in found["Service"]["spec"]["ports"]] == protocols
+
+
+def pod_of(*options: str) -> tuple[dict[str, Any], dict[str, Any]]:
+    """The pod and its container."""
+    pod: dict[str, Any] = documents(*options)["Deployment"]["spec"]["template"]["spec"]
+    (container,) = pod["containers"]
+    return pod, container
+
+
+@needs_helm
+def test_a_map_in_a_store_is_pinned_by_its_url_and_rolled_out_pod_by_pod() -> None:
+    found = documents(*STORED, "--set", "maps.store=credentials")
+    (container,) = found["Deployment"]["spec"]["template"]["spec"]["containers"]
+    variables = {each["name"]: each.get("value") for each in container["env"]}
+    assert variables["STREETFIX_MAPS"] == f"s3://bucket/maps/town@{VERSION}:gs://bucket/city"
+    settings = Settings(maps=variables["STREETFIX_MAPS"])  # type: ignore[arg-type]  # as the environment gives it
+    assert [str(each) for each in settings.maps] == [f"s3://bucket/maps/town@{VERSION}", "gs://bucket/city"]
+    assert variables["STREETFIX_TILE_CACHE"] == "/cache"
+    assert variables["STREETFIX_TILE_CACHE_BYTES"] == "20000000000"
+    assert container["envFrom"] == [{"secretRef": {"name": "credentials"}}]
+    # Another version is another pod template. A pod goes only when a new one is ready.
+    assert found["Deployment"]["spec"]["strategy"]["rollingUpdate"] == {"maxUnavailable": 0, "maxSurge": 1}
+    egress = found["NetworkPolicy"]["spec"]["egress"]
+    assert {"to": [{"ipBlock": {"cidr": "10.1.0.0/16"}}]} in egress
+
+
+@needs_helm
+def test_a_volume_and_a_store_stand_beside_each_other() -> None:
+    pod, container = pod_of(*STORED, "--set", "maps.claim=maps")
+    (maps,) = (each["value"] for each in container["env"] if each["name"] == "STREETFIX_MAPS")
+    assert maps == f"/maps:s3://bucket/maps/town@{VERSION}:gs://bucket/city"
+    assert {"maps", "cache"} <= {each["name"] for each in pod["volumes"]}
+
+
+@needs_helm
+@pytest.mark.parametrize(
+    ("options", "volume"),
+    [
+        ("", {"emptyDir": {"sizeLimit": "30Gi"}}),
+        ("maps.cache.hostPath=/var/lib/tiles", {"hostPath": {"path": "/var/lib/tiles", "type": "Directory"}}),
+        (
+            "maps.cache.storageClass=nvme,maps.cache.size=1Ti",
+            {
+                "ephemeral": {
+                    "volumeClaimTemplate": {
+                        "spec": {
+                            "accessModes": ["ReadWriteOnce"],
+                            "storageClassName": "nvme",
+                            "resources": {"requests": {"storage": "1Ti"}},
+                        }
+                    }
+                }
+            },
+        ),
+    ],
+)
+def test_where_the_cache_lies(options: str, volume: dict[str, Any]) -> None:
+    pod, container = pod_of(*STORED, *(["--set", options] if options else []))
+    assert {"name": "cache", "mountPath": "/cache"} in container["volumeMounts"]
+    (cache,) = (each for each in pod["volumes"] if each["name"] == "cache")
+    assert cache == {"name": "cache"} | volume
+
+
+@needs_helm
+@pytest.mark.parametrize(
+    ("options", "zones", "machines"),
+    [
+        ([], "ScheduleAnyway", "ScheduleAnyway"),
+        (["--set", "spread.zones=DoNotSchedule"], "DoNotSchedule", "ScheduleAnyway"),
+        (["--set", "spread.machines=DoNotSchedule"], "ScheduleAnyway", "DoNotSchedule"),
+    ],
+)
+def test_pods_spread_over_zones_and_machines(options: list[str], zones: str, machines: str) -> None:
+    pod, _ = pod_of(*BASE, *KEYS, *options)
+    found = {each["topologyKey"]: each for each in pod["topologySpreadConstraints"]}
+    rules = {key: each["whenUnsatisfiable"] for key, each in found.items()}
+    assert rules == {"topology.kubernetes.io/zone": zones, "kubernetes.io/hostname": machines}
+    for each in found.values():
+        is_strict = each["whenUnsatisfiable"] == "DoNotSchedule"
+        assert each["maxSkew"] == 1
+        assert set(each["labelSelector"]["matchLabels"]) == {"app.kubernetes.io/name", "app.kubernetes.io/instance"}
+        assert each.get("matchLabelKeys") == (["pod-template-hash"] if is_strict else None)
+        assert each.get("nodeTaintsPolicy") == ("Honor" if is_strict else None)
+
+
+@needs_helm
+def test_without_routing_nothing_is_routed() -> None:
+    assert not {"Ingress", "HTTPRoute", "BackendTrafficPolicy"} & set(documents(*BASE, *KEYS))
+
+
+@needs_helm
+def test_envoy_gateway_hashes_the_header_of_the_client() -> None:
+    found = documents(
+        *(*BASE, *KEYS, *ROUTING, "--set", "routing.gateway.name=eg,routing.gateway.namespace=edge,service.http=8080")
+    )
+    route, policy, service = (found[kind] for kind in ("HTTPRoute", "BackendTrafficPolicy", "Service"))
+    assert route["spec"]["parentRefs"] == [{"name": "eg", "namespace": "edge"}]
+    assert route["spec"]["hostnames"] == ["maps.example"]
+    (rule,) = route["spec"]["rules"]
+    assert rule["backendRefs"] == [{"name": service["metadata"]["name"], "port": 8080}]
+    assert 8080 in [each["port"] for each in service["spec"]["ports"]]
+    assert float(rule["timeouts"]["request"].removesuffix("s")) > Settings.model_fields["request_timeout_s"].default
+    (target,) = policy["spec"]["targetRefs"]
+    assert target == {
+        "group": "gateway.networking.k8s.io",
+        "kind": "HTTPRoute",
+        "name": route["metadata"]["name"],
+    }
+    assert policy["spec"]["loadBalancer"] == {
+        "type": "ConsistentHash",
+        "consistentHash": {"type": "Header", "header": {"name": HEADER}},
+    }
+    assert "Ingress" not in found
+
+
+@needs_helm
+@pytest.mark.parametrize("tls", [False, True])
+@pytest.mark.parametrize(
+    ("controller", "hashes", "speaks_tls"),
+    [
+        (
+            "nginx",
+            {"nginx.org/lb-method": "hash $http_x_streetfix_cell consistent", "nginx.org/client-max-body-size": "64m"},
+            {"nginx.org/ssl-services": "x-streetfix"},
+        ),
+        (
+            "ingress-nginx",
+            {
+                "nginx.ingress.kubernetes.io/upstream-hash-by": "$http_x_streetfix_cell",
+                "nginx.ingress.kubernetes.io/proxy-body-size": "64m",
+            },
+            {"nginx.ingress.kubernetes.io/backend-protocol": "HTTPS"},
+        ),
+    ],
+)
+def test_an_ingress_hashes_the_header_of_the_client(
+    controller: str, hashes: dict[str, str], speaks_tls: dict[str, str], tls: bool
+) -> None:
+    options = (
+        f"routing.controller={controller},routing.tls=host,routing.ingressClass=edge,routing.annotations.team=maps"
+    )
+    found = documents(*BASE, *KEYS, *ROUTING, "--set", options, *(["--set", "tls.secret=tls"] if tls else []))
+    ingress, service = found["Ingress"], found["Service"]
+    assert HEADER.lower().replace("-", "_") == "x_streetfix_cell"
+    assert ingress["metadata"]["annotations"] == hashes | (speaks_tls if tls else {}) | {"team": "maps"}
+    assert ingress["spec"]["ingressClassName"] == "edge"
+    assert ingress["spec"]["tls"] == [{"hosts": ["maps.example"], "secretName": "host"}]
+    (rule,) = ingress["spec"]["rules"]
+    assert rule["host"] == "maps.example"
+    (path,) = rule["http"]["paths"]
+    assert path["backend"]["service"] == {"name": service["metadata"]["name"], "port": {"name": "http"}}
+    assert not {"HTTPRoute", "BackendTrafficPolicy"} & set(found)
 
 
 @needs_helm
