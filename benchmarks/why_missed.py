@@ -267,12 +267,12 @@ WHY_MISSED: dict[str, Reason] = {
 WHY_MISSED["full.condition.sideways.within_1_m"] = Reason(
     0.946,
     "Confidence causes the loss: 488 of 500 forced answers are within 1 m (484 with the encoder before), and 15 of these are refused. One "
-    "accepted answer is wrong. The default needs a confidence of 0.9 since decision 0149, and this row was measured before it",
+    "accepted answer is wrong. The default needs a confidence of 0.9 since decision 0149",
 )
 WHY_MISSED["full.condition.depth_15m_sequence5.within_1_m"] = Reason(
     0.9733333333333334,
     "Confidence causes the loss: all 300 forced answers are within 1 m, and 8 are refused. None is wrong. The default needs a confidence "
-    "of 0.9 since decision 0149, and this row was measured before it",
+    "of 0.9 since decision 0149",
 )
 WHY_MISSED["sequence.landmark.within_1_m"] = Reason(
     0.6944444444444444,
