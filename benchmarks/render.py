@@ -21,12 +21,16 @@ from matplotlib.figure import Figure
 HEAD = """# Reports
 
 `make reports` writes this page from the JSON files beside it. The figures in the tables come from runs; the column *run* names the run
-that measured the row. The reasons below a table are written by people (`benchmarks/why_missed.py`), each for the one value that it names;
-when that value has changed, the page says so instead of the reason. **Stale** means that code that the row measures has changed since the
-row's commit. Changes of comments, docstrings and layout do not count. *Same answers* means that code changed, but `make same-answers`
-compared both versions: maps and answers were equal to the bit. `checks/same_answers.json` names the datasets.
-*Age unknown* means that Git could not tell.
+that measured the row. People write the reasons below a table (`benchmarks/why_missed.py`). Each reason explains one value. If the value
+has changed since, the page says so instead of the reason.
+
+**Stale** means that code that the row measures has changed since the row's commit. Changes of comments, docstrings and layout do not count.
+*Same answers* means that code changed, but `make same-answers` compared both versions: maps and answers were equal to the bit.
+`checks/same_answers.json` names the datasets. *Age unknown* means that Git could not tell.
 """
+
+#: Terms in the notes of earlier runs, and the terms of the glossary that replaced them.
+_TERMS = {"watch city": "validation city"}
 
 
 def main() -> None:
@@ -67,7 +71,7 @@ def _section(name: str, report: dict[str, Any]) -> list[str]:
             f"{same} rows have the same answers although code changed. `make same-answers` compared both versions.",
             "",
         ]
-    lines += [f"{text}\n" for text in notes.values() if isinstance(text, str)]
+    lines += [f"{_in_present_terms(text)}\n" for text in notes.values() if isinstance(text, str)]
     lines += ["| row | value | 95 % interval | n | bar | | run | |", "|---|---|---|---|---|---|---|---|"]
     lines += [_line(row, numbers[row["run"]]) for row in rows]
     lines += _conditions({row["id"]: row["value"] for row in rows})
@@ -89,10 +93,16 @@ def _section(name: str, report: dict[str, Any]) -> list[str]:
         lines += [f"![reliability]({_reliability(name, notes['reliability']).name})", ""]
     if "accepts" in notes:
         picture = _accepts(name, notes["accepts"])
-        lines += [f"![false accepts against true accepts, for each kind of stranger]({picture.name})", ""]
+        lines += [f"![false accepts against true accepts, for each kind of out-of-map query]({picture.name})", ""]
     if name == fell.REPORT.stem:
         lines += fell.lines(fell.fallen(fell.kept_values(), rows))
     return lines
+
+
+def _in_present_terms(note: str) -> str:
+    for old, new in _TERMS.items():
+        note = note.replace(old, new)
+    return note
 
 
 def _run_line(number: int, run: dict[str, Any], rows: list[dict[str, Any]]) -> str:
@@ -202,7 +212,7 @@ def _accepts(name: str, curves: dict[str, list[list[float]]]) -> Path:
         ):
             label = kind.removesuffix(f".{preset}").replace("_", " ")
             axes.plot([p[0] for p in points], [p[1] for p in points], label=label, color=f"C{number}")
-        axes.set(xlim=(0, 1), ylim=(0.5, 1.01), title=preset, xlabel="strangers accepted")
+        axes.set(xlim=(0, 1), ylim=(0.5, 1.01), title=preset, xlabel="out-of-map queries accepted")
         axes.set_xscale("symlog", linthresh=0.01)
         axes.set_xticks([0, 0.01, 0.1, 1], ["0", "1 %", "10 %", "all"])
         axes.grid(alpha=0.3)

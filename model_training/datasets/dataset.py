@@ -47,7 +47,8 @@ ODOMETRY_FILE = "odometry.txt"
 Transforms = NDArray[np.float64]
 #: File endings of colour images.
 PICTURES = (".jpg", ".jpeg", ".png", ".webp")
-
+#: Form of a pose in TUM format, for messages.
+TUM_LINE = "`timestamp x y z qx qy qz qw` (seconds, metres, unit quaternion)"
 
 #: Name, size in bytes and modification time in nanoseconds of a scan's file.
 ScanFile = tuple[str, int, int]
@@ -454,19 +455,31 @@ class Dataset:
         names = _camera_names(folder, len(pictures))
         cameras = {camera.name: camera for camera in self.description.sensors.cameras}
         if not cameras:
-            raise DatasetError(f"{self.folder}/dataset.json has no camera", field="sensors.cameras")
+            raise DatasetError(
+                f"{self.folder}/dataset.json has no camera; add the camera of the queries to sensors.cameras",
+                field="sensors.cameras",
+            )
         first = next(iter(cameras))
         for rgb_path in pictures:
             number = int(rgb_path.stem)
             depth_path = next((p for p in (folder / "depth").glob(f"{rgb_path.stem}.*")), None)
             if depth_path is None:
-                raise DatasetError(f"{folder}/depth has no image {rgb_path.stem}", field="depth")
+                raise DatasetError(
+                    f"{folder}/depth has no image {rgb_path.stem}; add it, or remove {rgb_path.name} from rgb",
+                    field="depth",
+                )
             if truth is not None and number >= len(truth):
-                raise DatasetError(f"{poses_path} has {len(truth)} lines, none for {rgb_path.name}", field="poses.txt")
+                raise DatasetError(
+                    f"{poses_path} has {len(truth)} poses, none for {rgb_path.name}; add one line per image, "
+                    "or remove the file if the ground truth is unknown",
+                    field="poses.txt",
+                )
             camera_name = names[number] if names else first
             if camera_name not in cameras:
                 raise DatasetError(
-                    f"{folder}/cameras.txt names {camera_name!r}, which is not in dataset.json", field="cameras.txt"
+                    f"{folder}/cameras.txt names {camera_name!r}, but dataset.json has {', '.join(cameras)}; "
+                    "use one of these names, or add the camera to sensors.cameras",
+                    field="cameras.txt",
                 )
             yield QueryFrame(
                 number,
@@ -494,7 +507,11 @@ def _camera_names(folder: Path, count: int) -> list[str] | None:
         return None
     names = read_bytes(path).decode(errors="replace").split()
     if len(names) != count:
-        raise DatasetError(f"{path} has {len(names)} lines for {count} images", field="cameras.txt")
+        raise DatasetError(
+            f"{path} has {len(names)} names for {count} images; write one camera name per image, "
+            "or remove the file if all images are of the first camera",
+            field="cameras.txt",
+        )
     return names
 
 
@@ -575,7 +592,7 @@ def read_tum(path: Path) -> tuple[NDArray[np.float64], Transforms]:
         DatasetError: the file is missing, or a line is not a pose.
     """
     if not path.is_file():
-        raise DatasetError(f"{path} is missing", field=path.name)
+        raise DatasetError(f"{path} is missing; write one pose per line: {TUM_LINE}", field=path.name)
     stamps, transforms = [], []
     for number, line in enumerate(read_bytes(path).decode(errors="replace").splitlines(), 1):
         if not line.strip() or line.startswith("#"):
@@ -583,10 +600,12 @@ def read_tum(path: Path) -> tuple[NDArray[np.float64], Transforms]:
         try:
             values = np.array(line.split(), np.float64)
         except ValueError as error:
-            raise DatasetError(f"{path}, line {number}: not numbers: {line[:60]!r}", field=path.name) from error
+            raise DatasetError(
+                f"{path}, line {number}: not numbers: {line[:60]!r}; write {TUM_LINE}", field=path.name
+            ) from error
         if len(values) != 8 or not np.isfinite(values).all() or np.linalg.norm(values[4:]) < 1e-6:
             raise DatasetError(
-                f"{path}, line {number}: not `timestamp x y z qx qy qz qw` with a unit quaternion: {line[:60]!r}",
+                f"{path}, line {number}: not a pose: {line[:60]!r}; write {TUM_LINE}, all finite, with a quaternion that is not zero",
                 field=path.name,
             )
         stamps.append(values[0])

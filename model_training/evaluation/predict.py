@@ -171,7 +171,9 @@ def predict(
     frames = list(dataset.queries(name))
     if not frames or frames[0].T_map_camera is None:
         raise DatasetError(
-            f"query set {name!r} of {dataset.folder} has no poses.txt, so nothing can be measured", field="queries"
+            f"query set {name!r} of {dataset.folder} has no images or no poses.txt, so nothing can be measured; "
+            "add the images and poses.txt (TUM format), or choose another query set",
+            field="queries",
         )
     groups = [frames[k : k + frames_each] for k in range(0, len(frames), frames_each)]
     answers: list[tuple[Answer | None, float]] = []

@@ -211,7 +211,9 @@ def open_carla(source: Path) -> CarlaFolder:
     except ValidationError as error:
         first = error.errors(include_url=False)[0]
         where = ".".join(str(part) for part in first["loc"])
-        raise DatasetError(f"{file}: {where}: {first['msg']}", field=where) from error
+        raise DatasetError(
+            f"{file}: {where}: {first['msg']}; correct this field, see docs/recordings.md", field=where
+        ) from error
     names, stamps, poses = _poses(source / "poses.csv")
     return CarlaFolder(source, recording, names, Trajectory(stamps, poses, str(source / "poses.csv")))
 
@@ -241,10 +243,16 @@ def _poses(path: Path) -> tuple[tuple[str, ...], np.ndarray, np.ndarray]:
             try:
                 values = [float(row[column]) for column in POSE_COLUMNS[1:]]
             except (KeyError, TypeError, ValueError) as error:
-                raise DatasetError(f"{path}, line {number}: not {', '.join(POSE_COLUMNS)}", field=path.name) from error
+                raise DatasetError(
+                    f"{path}, line {number}: not numbers in the columns {', '.join(POSE_COLUMNS)}; the first line of the file "
+                    "names the columns, and each further line has one number per column",
+                    field=path.name,
+                ) from error
             if not (row["frame"] or "").isdigit() or not np.isfinite(values).all():
                 raise DatasetError(
-                    f"{path}, line {number}: the frame is not a number, or a value is not finite", field=path.name
+                    f"{path}, line {number}: the frame {(row['frame'] or '')[:20]!r} is not an integer, or a value is not finite; "
+                    "correct or remove this line",
+                    field=path.name,
                 )
             names.append(row["frame"])
             stamps.append(values[0])

@@ -12,6 +12,7 @@ from service.geometry.distortion import COEFFICIENTS, coefficient_problem
 from service.geometry.rigid import Transform
 
 _KEYS = ("T_vehicle_lidar", "T_vehicle_camera")
+_EXAMPLE = " or ".join(_KEYS) + ", each as 4 rows of 4 numbers"
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,9 +40,12 @@ def read_extrinsics(path: Path) -> Extrinsics:
     try:
         loaded = json.loads(path.read_text())
     except (OSError, UnicodeDecodeError, json.JSONDecodeError) as error:
-        raise DatasetError(f"{path}: cannot be read as JSON: {error}", field="extrinsics") from error
+        raise DatasetError(
+            f"{path}: cannot be read as JSON: {error}; give a JSON file with {_EXAMPLE}", field="extrinsics"
+        ) from error
     if not isinstance(loaded, dict) or not loaded.keys() <= set(_KEYS):
-        raise DatasetError(f"{path}: expected an object with {' and '.join(_KEYS)}", field="extrinsics")
+        found = ", ".join(map(str, loaded)) if isinstance(loaded, dict) else type(loaded).__name__
+        raise DatasetError(f"{path}: found {found[:200]}; write an object with {_EXAMPLE}", field="extrinsics")
     return Extrinsics(**{key: _rigid(path, key, value) for key, value in loaded.items()})
 
 
@@ -70,9 +74,18 @@ def read_camera(path: Path) -> PinholeCamera:
         TypeError,
         ValueError,
     ) as error:
-        raise DatasetError(f"{path}: not a valid camera: {type(error).__name__}: {error}", field="camera") from error
+        raise DatasetError(
+            f"{path}: not a valid camera: {type(error).__name__}: {error}; write JSON with width, height, fx, fy, cx and cy "
+            "in pixels",
+            field="camera",
+        ) from error
     if not all(np.isfinite(x) and x > 0 for key, x in numbers.items() if key not in ("cx", "cy")):
-        raise DatasetError(f"{path}: width, height, fx and fy must be more than 0", field="camera")
+        bad = ", ".join(f"{key} {x:g}" for key, x in numbers.items() if key not in ("cx", "cy"))
+        raise DatasetError(
+            f"{path}: width, height, fx and fy must be more than 0; the file has {bad}. Give the values of the calibration, "
+            "in pixels",
+            field="camera",
+        )
     if model not in COEFFICIENTS:
         raise DatasetError(
             f"{path}: distortion_model: {model!r} is not valid; choose one of: {', '.join(COEFFICIENTS)}",
@@ -96,10 +109,17 @@ def _rigid(path: Path, key: str, value: object) -> Transform:
     try:
         T = np.array(value, np.float64)
     except (TypeError, ValueError) as error:
-        raise DatasetError(f"{path}: {key} is not a matrix of numbers", field=key) from error
+        raise DatasetError(f"{path}: {key} is not a matrix of numbers; write 4 rows of 4 numbers", field=key) from error
     if T.shape != (4, 4) or not np.isfinite(T).all() or not np.allclose(T[3], [0, 0, 0, 1]):
-        raise DatasetError(f"{path}: {key} is not 4 rows of 4 numbers, the last 0 0 0 1", field=key)
+        raise DatasetError(
+            f"{path}: {key} has shape {T.shape} or a wrong last row; write 4 rows of 4 finite numbers, the last row 0 0 0 1",
+            field=key,
+        )
     R = T[:3, :3]
     if not np.allclose(R @ R.T, np.eye(3), atol=1e-4) or np.linalg.det(R) < 0:
-        raise DatasetError(f"{path}: {key} has no valid rotation (the columns are not orthonormal)", field=key)
+        raise DatasetError(
+            f"{path}: {key} has no valid rotation: its first three columns must be orthonormal and right-handed (determinant 1). "
+            "Write more digits, or correct the axes",
+            field=key,
+        )
     return T

@@ -72,9 +72,17 @@ def _times(path: Path, last: int) -> list[float]:
     try:
         times = [float(line) for line in read_bytes(path).decode("ascii").split()]
     except ValueError as error:
-        raise DatasetError(f"{path}: not one number per line: {error}", field=path.name) from error
+        raise DatasetError(
+            f"{path}: not one number per line: {error}; write the seconds of one frame per line, or remove the file "
+            f"to use {RATE_HZ:g} frames/s",
+            field=path.name,
+        ) from error
     if len(times) <= last:
-        raise DatasetError(f"{path} has {len(times)} lines, but there is a frame {last:06d}", field=path.name)
+        raise DatasetError(
+            f"{path} has {len(times)} times, but there is a frame {last:06d}; add the missing lines, or remove the file "
+            f"to use {RATE_HZ:g} frames/s",
+            field=path.name,
+        )
     return times
 
 
@@ -87,7 +95,11 @@ def _poses(path: Path, stamps: list[float], T_lidar_cam0: np.ndarray) -> Traject
         try:
             values = np.array(line.split(), np.float64).reshape(3, 4)
         except ValueError as error:
-            raise DatasetError(f"{path}, line {number + 1}: not the 12 numbers of a pose", field=path.name) from error
+            raise DatasetError(
+                f"{path}, line {number + 1}: not the 12 numbers of a pose: {line[:60]!r}; write the 3 x 4 matrix "
+                "T_world_cam0 row by row, or remove the file to import without poses",
+                field=path.name,
+            ) from error
         if number < len(stamps):
             poses.append(T_lidar_cam0 @ transform_from(values[:, :3], values[:, 3]) @ inverse(T_lidar_cam0))
             times.append(stamps[number])

@@ -46,11 +46,14 @@ def _packet(path: Path) -> NDArray[np.float64]:
     try:
         values = np.array(path.read_text(encoding="ascii").split()[:6], np.float64)
     except (OSError, ValueError) as error:
-        raise DatasetError(f"{path}: not a packet of the inertial system: {error}", field=path.name) from error
+        raise DatasetError(
+            f"{path}: not a packet of the inertial system: {error}; copy the file again from KITTI's download",
+            field=path.name,
+        ) from error
     if len(values) < 6 or not np.isfinite(values).all():
         raise DatasetError(
             f"{path}: expected latitude, longitude, altitude, roll, pitch and yaw; the packet has {len(values)} of 6 "
-            "numbers",
+            "numbers, or one is not finite. Copy the file again from KITTI's download",
             field=path.name,
         )
     return values

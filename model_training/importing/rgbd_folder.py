@@ -213,13 +213,20 @@ def _listed(path: Path) -> list[tuple[float, Path]]:
         try:
             stamp_s, name = float(parts[0]), parts[1]
         except (ValueError, IndexError) as error:
-            raise DatasetError(f"{path}, line {number}: not `timestamp file`", field=path.name) from error
+            raise DatasetError(
+                f"{path}, line {number}: not `timestamp file`: {line[:60]!r}; write seconds and a path, with a space between",
+                field=path.name,
+            ) from error
         named = (path.parent / name).resolve()
         if not named.is_relative_to(path.parent.resolve()):
-            raise DatasetError(f"{path}, line {number}: the file is outside the recording", field=path.name)
+            raise DatasetError(
+                f"{path}, line {number}: the file {name[:60]!r} is outside the recording; copy it into {path.parent} "
+                "and give its path relative to this folder",
+                field=path.name,
+            )
         found.append((stamp_s, named))
     if not found:
-        raise DatasetError(f"{path} lists no image", field=path.name)
+        raise DatasetError(f"{path} lists no image; write one line `timestamp file` per image", field=path.name)
     return found
 
 
@@ -229,7 +236,11 @@ def _open3d_camera(path: Path) -> PinholeCamera:
         K = np.array(loaded["intrinsic_matrix"], np.float64).reshape(3, 3).T  # stored column by column
         return PinholeCamera(int(loaded["width"]), int(loaded["height"]), K[0, 0], K[1, 1], K[0, 2], K[1, 2])
     except (OSError, json.JSONDecodeError, KeyError, TypeError, ValueError) as error:
-        raise DatasetError(f"{path}: not a camera file of Open3D: {error}", field=path.name) from error
+        raise DatasetError(
+            f"{path}: not a camera file of Open3D ({type(error).__name__}: {error}); it needs width, height and "
+            "intrinsic_matrix (9 numbers, column by column). Correct it, or give --camera FILE",
+            field=path.name,
+        ) from error
 
 
 def _open3d_poses(path: Path) -> Trajectory:
@@ -241,11 +252,17 @@ def _open3d_poses(path: Path) -> Trajectory:
             T = np.array([line.split() for line in lines[start + 1 : start + 5]], np.float64).reshape(4, 4)
             stamps.append(int(lines[start].split()[0]) / RATE_HZ)
         except (ValueError, IndexError) as error:
-            raise DatasetError(f"{path}, line {start + 1}: not a frame of five lines", field=path.name) from error
+            raise DatasetError(
+                f"{path}, line {start + 1}: not a frame of five lines; write a line of three integers, then the four rows "
+                "of T_world_camera",
+                field=path.name,
+            ) from error
         R = T[:3, :3]
         if not (np.isfinite(T).all() and np.allclose(R @ R.T, np.eye(3), atol=1e-3)):
             raise DatasetError(
-                f"{path}, line {start + 1}: the matrix of the frame is not a valid pose", field=path.name
+                f"{path}, line {start + 1}: the matrix of the frame is not a valid pose; its rotation must be orthonormal "
+                "and its numbers finite. Correct or remove the five lines of this frame",
+                field=path.name,
             )
         poses.append(T)
     return Trajectory(np.array(stamps), np.array(poses).reshape(-1, 4, 4), str(path))

@@ -14,6 +14,10 @@ _MEND = (
     "(.db3), then `ros2 bag reindex` its folder"
 )
 
+#: Description of a ROS 2 bag, in its folder.
+_METADATA = "metadata.yaml"
+_BAG_FILES = (".bag", ".mcap", ".db3")
+
 
 @dataclass(frozen=True, slots=True)
 class Message:
@@ -116,6 +120,7 @@ def opened(path: Path) -> Iterator[BagReader]:
     Raises:
         DatasetError: it cannot be opened.
     """
+    _require_bag(path)
     from rosbags.highlevel import AnyReader
     from rosbags.typesys import Stores, get_typestore
 
@@ -131,6 +136,22 @@ def opened(path: Path) -> Iterator[BagReader]:
         yield BagReader(path.name, reader)
     finally:
         reader.close()
+
+
+def _require_bag(path: Path) -> None:
+    """Refuse a folder that is not a ROS 2 bag. Name the bags in it, if there are any.
+
+    Raises:
+        DatasetError: the folder has no ``metadata.yaml``.
+    """
+    if not path.is_dir() or (path / _METADATA).is_file():
+        return
+    files = sorted(each for each in path.iterdir() if each.suffix in _BAG_FILES)
+    bags = files or sorted(each.parent for each in path.glob(f"*/{_METADATA}"))
+    found = f": {', '.join(map(str, bags[:3]))}" if bags else f", or a file that ends in {', '.join(_BAG_FILES)}"
+    raise DatasetError(
+        f"{path} has no {_METADATA}; give the {'file' if files else 'folder'} of the bag{found}", field="source"
+    )
 
 
 def _message_of(error: Exception) -> str:

@@ -73,7 +73,10 @@ def read_openstreetmap(
     import osmium
 
     if not path.is_file():
-        raise DatasetError(f"{path}: file not found", field=path.name)
+        raise DatasetError(
+            f"{path}: file not found; give an extract of OpenStreetMap, for example town.osm or town.osm.pbf",
+            field=path.name,
+        )
     of_name: dict[str, list[_Way]] = defaultdict(list)
     left_out: Counter[str] = Counter()
     try:

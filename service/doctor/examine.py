@@ -88,7 +88,7 @@ def check_settings(given: DoctorInputs) -> tuple[Finding, Settings | None]:
 
 def _machine(given: DoctorInputs, finding: Finding, settings: Settings | None) -> Iterator[Finding]:
     yield machine.check_platform()
-    yield machine.check_cores()
+    yield machine.check_cores(settings)
     yield machine.check_instructions()
     yield machine.check_shared_memory()
     yield machine.check_libraries(machine.LIBRARIES)

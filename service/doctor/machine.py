@@ -19,7 +19,8 @@ from service.doctor.finding import Finding
 from service.errors import StreetfixError, UnsupportedPlatformError
 from service.platforms import require_supported
 from service.runtime.serving_table import SharedMemory
-from service.runtime.threads import cpu_quota, usable_cores
+from service.runtime.settings import Settings
+from service.runtime.threads import cpu_quota, threads_per_process, usable_cores
 
 _MIB = 2**20
 #: Free space of the temporary folder for the metrics of the most workers, 64: three files of 256 KiB each (``service.cli.shared_counts``).
@@ -52,17 +53,31 @@ def check_platform() -> Finding:
     )
 
 
-def check_cores(cgroup: Path = Path("/sys/fs/cgroup")) -> Finding:
-    """Report the cores that a service may use.
+def check_cores(settings: Settings | None, cgroup: Path = Path("/sys/fs/cgroup")) -> Finding:
+    """Report the cores that a service may use, and whether its processes and threads exceed them.
 
     Args:
+        settings: of the service; None if they are invalid, then only the cores are reported.
         cgroup: folder of the control groups.
     """
     usable, all_cores, quota = usable_cores(cgroup), os.cpu_count() or 1, cpu_quota(cgroup)
     limited = "" if quota is None else f"; a quota allows {quota:g} cores of processor time"
-    return Finding(
-        "cores", "ok", f"{usable} of {all_cores} usable: a service works on {usable} requests at once{limited}"
-    )
+    found = f"{usable} of {all_cores} usable"
+    if settings is None:
+        return Finding("cores", "ok", found + limited)
+    workers = settings.workers
+    threads = threads_per_process(settings.threads, workers=workers, cores=usable)
+    found += f": a service works on {workers * threads} requests at once (workers: {workers}, threads of each: {threads}){limited}"
+    if workers * threads > usable:
+        return Finding(
+            "cores",
+            "warning",
+            f"{found}, and requests beyond {usable} wait for a core",
+            f"unset STREETFIX_THREADS, or set it to {max(1, usable // workers)}"
+            if workers <= usable
+            else f"set STREETFIX_WORKERS to at most {usable}, and unset STREETFIX_THREADS",
+        )
+    return Finding("cores", "ok", found)
 
 
 def check_instructions(cpuinfo: Path = Path("/proc/cpuinfo")) -> Finding:

@@ -197,7 +197,7 @@ def split_multipart(body: bytearray, content_type: str, *, max_parts: int) -> di
             raise TooLargeError(f"the body has more than {max_parts} parts; send rgb, depth and request only")
         after_line = _next(body, b"\r\n", start, at_most=256)
         if body[start:after_line].strip(b" \t"):
-            raise _malformed("there is text after a boundary")
+            raise _malformed("a boundary must end its line, but text follows")
         end = _next(body, delimiter, after_line)
         name, content = _part(body, after_line, end)
         if name in parts:
@@ -291,7 +291,7 @@ def _boundary_of(content_type: str) -> bytes:
         )
     boundary = header.get_param("boundary")
     if not isinstance(boundary, str) or not _BOUNDARY.fullmatch(boundary):
-        raise _malformed("the content type has no valid boundary")
+        raise _malformed(f"the content type {content_type[:80]!r} has no valid boundary")
     return boundary.encode("ascii")
 
 
@@ -299,12 +299,12 @@ def _part(body: bytearray, start: int, end: int) -> tuple[str, bytes]:
     """Return name and content of the part between two delimiters. ``start`` is at the line break after the first one."""
     blank = body.find(b"\r\n\r\n", start, min(end, start + _HEADERS_AT_MOST))
     if blank < 0:
-        raise _malformed("a part has no headers, or more than 4 KiB of them")
+        raise _malformed(f"a part has no headers, or more than {_HEADERS_AT_MOST} bytes of them")
     for line in bytes(body[start:blank]).split(b"\r\n"):
         name, _, value = line.partition(b":")
         if name.strip().lower() == b"content-disposition":
             return _name_from(value.decode("utf-8", "replace")), bytes(memoryview(body)[blank + 4 : end])
-    raise _malformed("a part has no Content-Disposition")
+    raise _malformed('a part has no header Content-Disposition: form-data; name="..."')
 
 
 @lru_cache(
@@ -315,14 +315,14 @@ def _name_from(disposition: str) -> str:
     header["content-disposition"] = disposition.strip()
     name = header.get_param("name", header="content-disposition")
     if header.get_content_disposition() != "form-data" or not isinstance(name, str) or not name:
-        raise _malformed("a part has no name")
+        raise _malformed(f"the header Content-Disposition {disposition.strip()[:80]!r} is not form-data with a name")
     return name[:64]
 
 
 def _next(body: bytearray, token: bytes, start: int, *, at_most: int | None = None) -> int:
     found = body.find(token, start, None if at_most is None else start + at_most)
     if found < 0:
-        raise _malformed("the body ends before its last boundary")
+        raise _malformed("the body ends before its last boundary, so a part of it is missing")
     return found
 
 

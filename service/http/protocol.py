@@ -95,7 +95,9 @@ class BoundedHttp(HttpToolsProtocol):
         """
         if len(self.pipeline) >= PIPELINED:
             # httptools turns this into a parser error, which gets status 400.
-            raise ValueError(f"more than {PIPELINED} pipelined requests")
+            raise ValueError(
+                f"more than {PIPELINED} pipelined requests; wait for responses, or open a further connection"
+            )
         self._in_head = False
         self._head_came()
         super().on_headers_complete()

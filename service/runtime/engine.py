@@ -43,7 +43,7 @@ from service.runtime.metrics import Metrics
 from service.runtime.seal import Seal
 from service.runtime.serving_table import ServingTable
 from service.runtime.settings import MapUrl, Settings
-from service.runtime.threads import limit_pools, usable_cores
+from service.runtime.threads import limit_pools, threads_per_process, usable_cores
 from service.runtime.tile_metrics import TileMetrics
 from service.runtime.tracing import Tracing
 from service.timing import stage, timed_request
@@ -139,7 +139,7 @@ class Engine:
         self.registry = registry
         self.settings = settings
         self.watcher = watcher or watcher_of(registry, settings, tiles)
-        self.threads = settings.threads or max(1, usable_cores() // settings.workers)
+        self.threads = threads_per_process(settings.threads, workers=settings.workers, cores=usable_cores())
         self.admission = Admission(threads=self.threads, queue=settings.queue, initializer=limit_pools)
         self.memory = budget_of(settings, threads=self.threads)
         self.metrics = Metrics(self.admission, registry, self.memory, tiles, self.watcher.cached_tiles)

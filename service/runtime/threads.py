@@ -46,6 +46,17 @@ def usable_cores(cgroup: Path = Path("/sys/fs/cgroup")) -> int:
     return cores if quota is None else max(1, min(cores, math.ceil(quota)))
 
 
+def threads_per_process(threads: int | None, *, workers: int, cores: int) -> int:
+    """Return the number of requests that one worker process works on at once; at least 1.
+
+    Args:
+        threads: setting of the operator (``STREETFIX_THREADS``); None shares the cores among the processes.
+        workers: number of processes.
+        cores: usable cores.
+    """
+    return threads or max(1, cores // workers)
+
+
 def cpu_quota(cgroup: Path) -> float | None:
     """Read the CPU quota of a control group, in cores; None if it has no limit.
 

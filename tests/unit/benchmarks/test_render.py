@@ -130,3 +130,8 @@ def test_published_figures_stand_beside_ours_and_missing_recordings_are_listed()
 def test_a_report_without_these_notes_has_neither():
     text = "\n".join(section({"id": "a"}))
     assert "recording" not in text
+
+
+def test_notes_of_earlier_runs_are_shown_in_present_terms():
+    report = {"runs": {}, "rows": [], "notes": {"trainings": "the watch city's 3196 places"}}
+    assert "the validation city's 3196 places\n" in render._section("choices", report)

@@ -9,6 +9,7 @@ import pytest
 
 from service.doctor import machine
 from service.errors import StreetfixError
+from service.runtime.settings import Settings
 
 
 def test_a_supported_platform_is_ok(monkeypatch):
@@ -33,9 +34,34 @@ def test_a_quota_limits_the_cores(monkeypatch, tmp_path):
     (tmp_path / "cpu.max").write_text("150000 100000\n")
     monkeypatch.setattr(os, "cpu_count", lambda: 8)
     monkeypatch.setattr(os, "sched_getaffinity", lambda _: set(range(8)), raising=False)
-    assert machine.check_cores(tmp_path).text == (
-        "2 of 8 usable: a service works on 2 requests at once; a quota allows 1.5 cores of processor time"
+    assert machine.check_cores(Settings(), tmp_path).text == (
+        "2 of 8 usable: a service works on 2 requests at once (workers: 1, threads of each: 2); "
+        "a quota allows 1.5 cores of processor time"
     )
+    assert machine.check_cores(None, tmp_path).text == "2 of 8 usable; a quota allows 1.5 cores of processor time"
+
+
+@pytest.mark.parametrize(
+    ("workers", "threads", "level", "at_once", "remedy"),
+    [
+        (1, None, "ok", 4, ""),
+        (2, None, "ok", 4, ""),
+        (3, None, "ok", 3, ""),  # 4 cores // 3 processes: one thread each
+        (2, 2, "ok", 4, ""),
+        (1, 7, "warning", 7, "unset STREETFIX_THREADS, or set it to 4"),
+        (2, 3, "warning", 6, "unset STREETFIX_THREADS, or set it to 2"),
+        (5, None, "warning", 5, "set STREETFIX_WORKERS to at most 4, and unset STREETFIX_THREADS"),
+    ],
+)
+def test_processes_and_threads_beyond_the_cores_get_a_warning(
+    monkeypatch, tmp_path, workers, threads, level, at_once, remedy
+):
+    """The machine has four cores and no quota."""
+    monkeypatch.setattr(os, "cpu_count", lambda: 4)
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _: set(range(4)), raising=False)
+    found = machine.check_cores(Settings(workers=workers, threads=threads), tmp_path)
+    assert (found.level, found.remedy) == (level, remedy)
+    assert f"a service works on {at_once} requests at once" in found.text
 
 
 @pytest.mark.parametrize(

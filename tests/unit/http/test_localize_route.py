@@ -433,3 +433,19 @@ def test_a_vehicle_on_the_ground_without_a_height_is_a_problem_that_names_the_fi
 ) -> None:
     problem = post(client, parts_of(**changed)).json()
     assert (problem["status"], problem["code"], problem["field"]) == (422, "request", field)
+
+
+def test_a_wrong_value_is_in_the_answer_but_not_in_the_log(
+    client: httpx.Client, parts_of: Parts, caplog: pytest.LogCaptureFixture
+) -> None:
+    parts = parts_of()
+    request = json.loads(parts["request"])
+    request["camera"]["fx"] = "private words"
+    with caplog.at_level("DEBUG"):
+        problem = require_problem(
+            post(client, parts | {"request": json.dumps(request).encode()}), 422, "request", "camera.fx"
+        )
+    assert '(given: "private words")' in problem["detail"]
+    assert "private words" not in caplog.text
+    assert any(record.name == "streetfix.requests" for record in caplog.records)
+    assert all("private words" not in str(vars(record)) for record in caplog.records)

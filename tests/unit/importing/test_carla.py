@@ -147,14 +147,22 @@ def test_frames_whose_files_are_missing_or_cut_off_are_counted(recorded):
     ("file", "text", "why"),
     [
         ("recording.json", None, "recording.json cannot be read .*the mounting of the sensors"),
-        ("recording.json", '{"lidar": {"channels": "many"}}', r"recording.json: lidar\.channels"),
+        (
+            "recording.json",
+            '{"lidar": {"channels": "many"}}',
+            r"recording.json: lidar\.channels: .*; correct this field",
+        ),
         ("poses.csv", None, "poses.csv is missing; it has one line per frame: frame, timestamp"),
         (
             "poses.csv",
             "frame,timestamp,x,y,z,roll,pitch,yaw\n1,0,0,0,0,0,0,0\n../2,1,0,0,0,0,0,0\n",
-            "poses.csv, line 3",
+            "poses.csv, line 3: the frame '../2' is not an integer, .*; correct or remove this line",
         ),
-        ("poses.csv", "frame,timestamp,x,y,z,roll,pitch,yaw\n1,zero,0,0,0,0,0,0\n", "poses.csv, line 2"),
+        (
+            "poses.csv",
+            "frame,timestamp,x,y,z,roll,pitch,yaw\n1,zero,0,0,0,0,0,0\n",
+            "line 2: not numbers in the columns .*; the first line",
+        ),
         ("poses.csv", "frame,timestamp\n1,0\n", "poses.csv, line 2"),
         ("poses.csv", "frame,timestamp,x,y,z,roll,pitch,yaw\n", "no pose"),
         ("poses.csv", "frame,timestamp,x,y,z,roll,pitch,yaw\n1,1,0,0,0,0,0,0\n2,1,0,0,0,0,0,0\n", "pose 2: its time"),

@@ -58,10 +58,13 @@ def test_mountings_are_read(tmp_path):
     ("text", "why"),
     [
         ("{", "cannot be read as JSON"),
-        ("[]", "an object with T_vehicle_lidar and T_vehicle_camera"),
-        ('{"T_lidar": 1}', "an object with"),
-        ('{"T_vehicle_lidar": "here"}', "T_vehicle_lidar is not a matrix of numbers"),
-        ('{"T_vehicle_lidar": [[1, 0], [0, 1]]}', "is not 4 rows of 4 numbers"),
+        ("[]", "found list; write an object with T_vehicle_lidar or T_vehicle_camera"),
+        ('{"T_lidar": 1}', "found T_lidar; write an object with"),
+        ('{"T_vehicle_lidar": "here"}', "T_vehicle_lidar is not a matrix of numbers; write 4 rows"),
+        (
+            '{"T_vehicle_lidar": [[1, 0], [0, 1]]}',
+            "has shape .2, 2. or a wrong last row; write 4 rows of 4 finite numbers",
+        ),
         ('{"T_vehicle_lidar": [[2,0,0,0],[0,2,0,0],[0,0,2,0],[0,0,0,1]]}', "has no valid rotation"),
         ('{"T_vehicle_lidar": [[1,0,0,0],[0,1,0,0],[0,0,-1,0],[0,0,0,1]]}', "has no valid rotation"),
     ],
@@ -111,5 +114,5 @@ def test_a_lens_that_is_none_is_refused_with_the_file(tmp_path, lens, why):
 )
 def test_a_camera_that_is_none_is_refused_with_the_file(tmp_path, text):
     (tmp_path / "camera.json").write_text(text)
-    with pytest.raises(DatasetError, match=r"camera\.json"):
+    with pytest.raises(DatasetError, match=r"camera\.json.*(write JSON with width|Give the values)"):
         read_camera(tmp_path / "camera.json")

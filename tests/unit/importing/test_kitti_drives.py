@@ -253,7 +253,7 @@ def test_times_that_end_early_or_are_none_are_named(drive):
     path = next(p for p in (drive / "times.txt", drive / "velodyne_points" / "timestamps.txt") if p.is_file())
     lines = path.read_text().splitlines()
     path.write_text("\n".join(lines[:2]) + "\n")
-    with pytest.raises(DatasetError, match=rf"{path.name} has 2 lines, but there is a frame 0+2"):
+    with pytest.raises(DatasetError, match=rf"{path.name} has 2 (times|lines), but there is a frame 0+2"):
         opened(drive)
     path.write_text("\n".join([lines[0], "noon", lines[2]]))
     with pytest.raises(DatasetError, match=path.name):

@@ -260,8 +260,22 @@ def test_a_file_that_is_no_bag_is_refused_with_its_name(tmp_path, name):
         opened(tmp_path / name)
 
 
-def test_an_empty_folder_is_refused(tmp_path):
-    with pytest.raises(DatasetError, match="cannot be opened as a ROS bag"):
+@pytest.mark.parametrize(
+    ("files", "remedy"),
+    [
+        ((), r"give the folder of the bag, or a file that ends in \.bag, \.mcap, \.db3$"),
+        (("b.mcap", "a.bag", "notes.txt"), r"give the file of the bag: \S*/a\.bag, \S*/b\.mcap$"),
+        (
+            ("monday/metadata.yaml", "monday/a.mcap", "friday/metadata.yaml"),
+            r"give the folder of the bag: \S*/friday, \S*/monday$",
+        ),
+    ],
+)
+def test_a_folder_without_metadata_is_refused_with_the_bags_in_it(tmp_path, files, remedy):
+    for name in files:
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).touch()
+    with pytest.raises(DatasetError, match=f"{tmp_path} has no metadata.yaml; {remedy}"):
         opened(tmp_path)
 
 

@@ -100,7 +100,7 @@ def test_a_file_that_is_no_openstreetmap_is_refused(tmp_path, read, text):
 
 
 def test_a_missing_file_is_named(tmp_path, read):
-    with pytest.raises(DatasetError, match=r"none\.osm: file not found"):
+    with pytest.raises(DatasetError, match=r"none\.osm: file not found; give an extract"):
         read(tmp_path / "none.osm")
 
 
