@@ -224,7 +224,7 @@ def test_a_map_in_a_store_is_pinned_by_its_url_and_rolled_out_pod_by_pod() -> No
     (container,) = found["Deployment"]["spec"]["template"]["spec"]["containers"]
     variables = {each["name"]: each.get("value") for each in container["env"]}
     assert variables["STREETFIX_MAPS"] == f"s3://bucket/maps/town@{VERSION}:gs://bucket/city"
-    settings = Settings(maps=variables["STREETFIX_MAPS"])  # type: ignore[arg-type]  # as the environment gives it
+    settings = Settings(maps=variables["STREETFIX_MAPS"])  # as the environment gives it
     assert [str(each) for each in settings.maps] == [f"s3://bucket/maps/town@{VERSION}", "gs://bucket/city"]
     assert variables["STREETFIX_TILE_CACHE"] == "/cache"
     assert variables["STREETFIX_TILE_CACHE_BYTES"] == "20000000000"
