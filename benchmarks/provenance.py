@@ -147,6 +147,8 @@ MEASURED: dict[str, dict[str, tuple[str, ...]]] = {
 
 #: Tiled maps, object storage and Qdrant.
 TILED_AND_STORED = (
+    "service/maps/ahead.py",
+    "service/maps/checked_tiles.py",
     "service/maps/joined_index.py",
     "service/maps/qdrant.py",
     "service/maps/search_address.py",
