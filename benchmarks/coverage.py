@@ -54,6 +54,7 @@ def coverage_rows(
     heading_rad: NDArray[np.float64],
     *,
     bars: bool = True,
+    why: str | None = None,
 ) -> Coverage | None:
     """Add the coverage of the covariances of right answers, accepted or not, and return it; no row without a right answer.
 
@@ -64,6 +65,7 @@ def coverage_rows(
         covariances: covariances (n, 6, 6); NaN without an answer.
         heading_rad: true heading of each camera, radians (n,).
         bars: whether the bars apply.
+        why: remark on all rows.
     """
     off_m = np.linalg.norm(errors[:, :3], axis=1)
     near = np.isfinite(covariances).all(axis=(1, 2)) & (np.nan_to_num(off_m, nan=np.inf) < RIGHT_M)
@@ -72,11 +74,12 @@ def coverage_rows(
         return None
     coverage_bar, gap_bar = (COVERAGE_BAR, SIGMA_GAP_BAR) if bars else (None, None)
     share = consistent(errors[near], covariances[near])
-    report.row(f"{row}.covariance_95_coverage", share, "share", bar=coverage_bar, n=count)
-    report.row(f"{row}.inside_95_ellipsoid", inside_95(errors[near], covariances[near]), "share", n=count)
+    report.row(f"{row}.covariance_95_coverage", share, "share", bar=coverage_bar, n=count, why=why)
+    report.row(f"{row}.inside_95_ellipsoid", inside_95(errors[near], covariances[near]), "share", n=count, why=why)
     gaps = sigma_gaps(heading_rad[near], errors[near], covariances[near])
     axis = max(gaps, key=lambda name: gaps[name])
-    report.row(f"{row}.sigma_coverage_gap", gaps[axis], "share", bar=gap_bar, better="lower", n=count, why=axis)
+    told = axis if why is None else f"{axis}; {why}"
+    report.row(f"{row}.sigma_coverage_gap", gaps[axis], "share", bar=gap_bar, better="lower", n=count, why=told)
     return Coverage(share, gaps[axis])
 
 

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.program_text import PROGRAMS, same_program
+from model_training.calibration.answer_code import CODE, hash_of
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -308,6 +309,22 @@ def _same_program(name: str, before: str, after: str) -> bool:
         return False
     one, other = git("cat-file", "blob", before), git("cat-file", "blob", after)
     return one is not None and other is not None and same_program(name, one, other)
+
+
+def commit_with_code(code: str, head: str = "HEAD") -> str | None:
+    """Return the newest commit up to ``head`` whose files have a hash of ``answer_code.hash_of``; None if Git finds none.
+
+    Args:
+        code: the hash.
+        head: commit at which the search begins.
+    """
+    commits = (git("rev-list", "--max-count=500", head, "--", *CODE) or "").split()
+    for commit in (git("rev-parse", head) or "", *commits):
+        listed = (git("ls-tree", "-r", "-z", commit, "--", *CODE) if commit else None) or ""
+        files = [entry.split("\t", 1) for entry in listed.split("\0") if entry]
+        if hash_of((path, about.split()[2]) for about, path in files) == code:
+            return commit
+    return None
 
 
 def git(*arguments: str) -> str | None:

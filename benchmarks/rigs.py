@@ -1,13 +1,22 @@
-"""Rig families: each one by a calibration that was fitted without it, and the coverage of its covariances."""
+"""Rig families: each one by a calibration that was fitted without it, and the coverage of its covariances.
 
+The coverage is in-sample for most families: the factors of the covariance (``OF_RAYS`` in ``service/registration/covariance.py``) were
+fitted to their answers. Decision 0179 has figures with factors that were fitted to the other families. Families in
+``NOT_IN_COVARIANCE`` took no part in that fit.
+"""
+
+from contextlib import nullcontext
+from datetime import UTC, datetime
 from pathlib import Path
 
 from benchmarks.coverage import Coverage, coverage_rows, worst_coverage_rows
+from benchmarks.provenance import Run, commit_with_code, git, machine
 from benchmarks.report import Report
+from model_training.calibration.answer_code import code_of_answers
 from model_training.calibration.cross_check import FamilyFigures, cross_check, cross_check_groups
 from model_training.calibration.families import NOT_FITTED, related
 from model_training.calibration.fit import CalibrationData
-from model_training.calibration.make import collected
+from model_training.calibration.make import codes_of_answers, collected
 from model_training.calibration.own_rig import WRONG_RATE
 from model_training.cli.progress import bars
 
@@ -15,6 +24,9 @@ from model_training.cli.progress import bars
 _REPEATING = "repeating"
 #: A phone's LiDAR of 5 m, and depth that covers some rows only. They have rows, but do not count in ``rigs.worst_within_1_m``.
 APART = ("iphone", "rings")
+#: Families to whose answers the factors of the covariance were not fitted (decision 0179).
+NOT_IN_COVARIANCE = ("monocular", "repeating", "oak_d", "kinect", "iphone", "rings")
+_IN_SAMPLE = "in-sample: the factors of the covariance were fitted to these answers; decision 0179 has held-out figures"
 #: Bars of each family, and of the worst one.
 _ECE, _WORST_ECE, _REFUSED, _WITHIN, _WORST_WITHIN = 0.05, 0.08, 0.05, 0.97, 0.94
 
@@ -24,7 +36,8 @@ def rig_rows(report: Report, encoder: Path, work: Path) -> None:
 
     The data are those of the calibration. Each family's figures come from a fit without this family. Families that the calibration is not
     fitted to count as well. The repeating blocks have rows but do not count as the worst. The rows ``rigs.without.*`` leave out all
-    families that share a LiDAR, a camera, a depth type or a survey spacing.
+    families that share a LiDAR, a camera, a depth type or a survey spacing. A note says which version of the code gave the answers, if
+    not the present one.
 
     Args:
         report: collects the rows.
@@ -33,12 +46,56 @@ def rig_rows(report: Report, encoder: Path, work: Path) -> None:
     """
     with bars() as progress:
         data = collected(work, encoder, report=progress)
+    codes = codes_of_answers(work, encoder)
+    run, report.notes["rigs"] = run_of_answers(codes, report.command)
+    with report.made_by(run) if run is not None else nullcontext():
+        _all_rows(report, data)
+
+
+def run_of_answers(codes: dict[str, str | None], command: str) -> tuple[Run | None, str | None]:
+    """Return the run that the rows belong to, and a note for the page. Answers are stored, so the present code need not have given them.
+
+    A row depends on the answers of all families, so the oldest version of the code counts.
+
+    Args:
+        codes: version of the code of each file of answers.
+        command: command of the report.
+
+    Returns:
+        None and None if the present code gave all answers. No run if the version of a file was not kept, or if no commit has it.
+    """
+    others = {name: code for name, code in codes.items() if code != code_of_answers()}
+    if not others:
+        return None, None
+    found = {code: commit_with_code(code) for code in set(others.values()) if code is not None}
+    lost = [name for name, code in others.items() if code is None or found[code] is None]
+    if lost:
+        return None, (
+            f"Rows `rigs.*`: the commit that gave the answers is unknown for {len(lost)} of {len(codes)} files, for example {lost[0]}. The "
+            "run below only fitted and counted."
+        )
+    commits = {commit for commit in found.values() if commit is not None}
+    oldest = min(commits, key=lambda commit: int(git("rev-list", "--count", commit) or 0))
+    return (
+        Run(
+            commit=oldest,
+            dirty=False,
+            before=datetime.now(UTC).isoformat(timespec="seconds"),
+            machine=machine(),
+            command=command,
+        ),
+        f"Rows `rigs.*`: the answers of {len(others)} of {len(codes)} files are of commits {', '.join(sorted(c[:10] for c in commits))}.",
+    )
+
+
+def _all_rows(report: Report, data: CalibrationData) -> None:
     figures, coverage = cross_check(data, not_fitted=NOT_FITTED), dict[str, Coverage]()
     for each in figures:
         row = f"rigs.{each.family}"
         _figure_rows(report, row, each)
         own = data.where(data.family == each.family)
-        found = coverage_rows(report, row, own.error, own.covariance, own.heading_rad)
+        why = None if each.family in NOT_IN_COVARIANCE else _IN_SAMPLE
+        found = coverage_rows(report, row, own.error, own.covariance, own.heading_rad, why=why)
         if found is not None and each.family != _REPEATING:
             coverage[each.family] = found
     worst_coverage_rows(report, "rigs", coverage)

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
+from model_training.calibration.answer_code import code_of_answers
 from model_training.calibration.collect import in_the_map, of_another_city, walls_and_rooms, where_streets_are_missing
 from model_training.calibration.cross_check import cross_check, table
 from model_training.calibration.families import FAMILIES, FAMILY_CITIES, NOT_FITTED, Family, family_plan
@@ -25,6 +26,8 @@ from service.maps.calibration import Calibration
 from service.maps.reader import MapBundle
 from service.retrieval.encoder import Encoder
 
+#: Name of the version of the code in a file of answers, and what to do with a damaged file.
+_CODE, _REMEDY = "code", "remove it, and the command sends its queries again"
 #: The query sets of the clear day.
 CLEAR_SETS = ("clear_precise", "clear_stereo")
 #: Progress callback: stage, finished steps, all steps.
@@ -64,7 +67,14 @@ def calibrate(
         "encoder_sha256": sha256,
     }
     fitted = data.where(~np.isin(data.family, NOT_FITTED))
-    return fit(fitted, measured_on=measured_on), table(cross_check(data, not_fitted=NOT_FITTED))
+    told = table(cross_check(data, not_fitted=NOT_FITTED))
+    codes = codes_of_answers(work, encoder)
+    others = sum(code != code_of_answers() for code in codes.values())
+    if others:
+        told.append(
+            f"{others} of {len(codes)} files of answers in {work} are of another version of the code; --anew asks again"
+        )
+    return fit(fitted, measured_on=measured_on), told
 
 
 def collected(work: Path, encoder: Path, *, anew: bool = False, report: Report = lambda *_: None) -> CalibrationData:
@@ -149,18 +159,48 @@ def _kept(
 
     Stored data need no city and no map. So the fit can be repeated where only the answers are.
     """
-    kept = work / f"asked-{plan.name}-{Encoder.open(encoder).sha256[:12]}.npz"
+    kept = _kept_file(work, encoder, plan)
     if not kept.exists() or anew:
         work.mkdir(parents=True, exist_ok=True)
         data, part = pooled(ask()), kept.with_suffix(".part.npz")
-        np.savez_compressed(part, **{name: getattr(data, name) for name in CalibrationData.__dataclass_fields__})
+        arrays = {name: getattr(data, name) for name in CalibrationData.__dataclass_fields__}
+        np.savez_compressed(part, **arrays, **{_CODE: np.array(code_of_answers())})
         part.rename(kept)
 
     def read() -> CalibrationData:
         with kept.open("rb") as file, np.load(file, allow_pickle=False) as arrays:
             return CalibrationData(*(arrays[name] for name in CalibrationData.__dataclass_fields__))
 
-    return read_arrays(kept, read, remedy="remove it, and the command sends its queries again")
+    return read_arrays(kept, read, remedy=_REMEDY)
+
+
+def codes_of_answers(work: Path, encoder: Path) -> dict[str, str | None]:
+    """Return which version of the code gave the stored answers, as ``code_of_answers`` names it, by file name.
+
+    None stands for a file of a release that did not keep it. Missing files are left out.
+
+    Args:
+        work: folder of cities, maps and answers.
+        encoder: the encoder, ONNX.
+    """
+    plans = [
+        *(calibration_plan(k) for k in range(CITIES)),
+        *(family_plan(family, 0) for family in FAMILIES),
+        repeating_plan(),
+    ]
+    found = dict[str, str | None]()
+    for kept in (path for plan in plans if (path := _kept_file(work, encoder, plan)).exists()):
+
+        def read(kept: Path = kept) -> str | None:
+            with kept.open("rb") as file, np.load(file, allow_pickle=False) as arrays:
+                return str(arrays[_CODE]) if _CODE in arrays.files else None
+
+        found[kept.name] = read_arrays(kept, read, remedy=_REMEDY)
+    return found
+
+
+def _kept_file(work: Path, encoder: Path, plan: SimulationPlan) -> Path:
+    return work / f"asked-{plan.name}-{Encoder.open(encoder).sha256[:12]}.npz"
 
 
 def _ask(work: Path, encoder: Path, index: int, report: Report) -> list[CalibrationData]:

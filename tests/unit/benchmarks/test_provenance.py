@@ -7,6 +7,7 @@ import pytest
 
 from benchmarks import provenance
 from benchmarks.provenance import MEASURED, NOT_RUN, ROOT, TILED_AND_STORED, mark_stale, measured_paths
+from model_training.calibration.answer_code import code_of_answers
 from service.maps import inverted_file
 
 REPORTS = sorted((ROOT / "reports").glob("*.json"))
@@ -158,6 +159,34 @@ def test_a_benchmark_does_not_load_what_it_claims_not_to_run(report):
 def test_the_maps_of_accuracy_rows_have_no_search_index():
     """Their rows do not depend on the code of the index. With a smaller limit they would."""
     assert inverted_file.SMALLEST >= provenance.MOST_VIEWS
+
+
+def test_the_commit_of_a_version_of_the_code_is_found(tmp_path, monkeypatch):
+    """The search goes back from the head. A change of other files does not matter."""
+    monkeypatch.setattr(provenance, "ROOT", tmp_path)
+
+    def git(*arguments):
+        identity = ["-c", "user.name=a", "-c", "user.email=a@b", "-c", "commit.gpgsign=false"]
+        done = subprocess.run(["git", *identity, *arguments], cwd=tmp_path, capture_output=True, text=True, check=True)
+        return done.stdout.strip()
+
+    def commit(file, text):
+        path = tmp_path / file
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(text)
+        git("add", ".")
+        git("commit", "-qm", file)
+        code_of_answers.cache_clear()
+        return git("rev-parse", "HEAD"), code_of_answers(tmp_path)
+
+    git("init", "-q")
+    (first, one), (second, two) = commit("service/maps/a.py", "1"), commit("service/maps/a.py", "2")
+    (third, same) = commit("docs/a.md", "3")
+    assert one != two == same
+    assert provenance.commit_with_code(one) == first
+    assert provenance.commit_with_code(two) in (second, third)
+    assert provenance.commit_with_code("0" * 16) is None
+    code_of_answers.cache_clear()
 
 
 def test_only_rows_of_single_stages_depend_on_their_code():

@@ -4,6 +4,7 @@ import pytest
 from benchmarks import rigs
 from benchmarks.full import gross_error_row
 from benchmarks.report import Report
+from model_training.calibration.answer_code import code_of_answers
 from model_training.calibration.cross_check import FamilyFigures
 from model_training.calibration.fit import CalibrationData, pooled
 from service.confidence.features import FEATURES
@@ -93,6 +94,40 @@ def test_a_family_without_a_query_in_the_map_refuses_no_right_answer(tmp_path):
     rigs._figure_rows(report, "rigs.lost", FamilyFigures("lost", 0, 40, 0, 0.0, none, none, none, none, 0.0))
     row = next(row for row in report.rows if row["id"] == "rigs.lost.right_but_refused")
     assert (row["value"], row["holds"], row["why"]) == (None, False, "no query in the map")
+
+
+def test_the_coverage_of_fitted_families_is_said_to_be_in_sample(rows):
+    """The factors of the covariance were fitted to the answers of the car, not to those of the sparse rings."""
+    assert rows["rigs.car.covariance_95_coverage"]["why"].startswith("in-sample")
+    assert "; in-sample" in rows["rigs.car.sigma_coverage_gap"]["why"]
+    assert "why" not in rows["rigs.rings.covariance_95_coverage"]
+    assert "in-sample" not in rows["rigs.rings.sigma_coverage_gap"]["why"]
+
+
+def test_stored_answers_of_the_present_code_belong_to_this_run():
+    assert rigs.run_of_answers({"a.npz": code_of_answers()}, "make it") == (None, None)
+
+
+def test_rows_of_older_answers_belong_to_the_oldest_commit_that_gave_them(monkeypatch):
+    commits = {"new": "b" * 40, "old": "a" * 40}
+    ages = {"a" * 40: "7", "b" * 40: "12"}
+    monkeypatch.setattr(rigs, "commit_with_code", commits.get)
+    monkeypatch.setattr(rigs, "git", lambda *arguments: ages[arguments[-1]])
+    codes = {"a.npz": "new", "b.npz": "old", "c.npz": code_of_answers()}
+    run, note = rigs.run_of_answers(codes, "make it")
+    assert run is not None
+    assert (run.commit, run.command, run.date) == ("a" * 40, "make it", None)
+    assert run.before
+    assert note == "Rows `rigs.*`: the answers of 2 of 3 files are of commits aaaaaaaaaa, bbbbbbbbbb."
+
+
+@pytest.mark.parametrize("code", [None, "of no commit"])
+def test_answers_of_an_unknown_version_are_said_to_be_so(monkeypatch, code):
+    monkeypatch.setattr(rigs, "commit_with_code", lambda _: None)
+    run, note = rigs.run_of_answers({"a.npz": code, "b.npz": code_of_answers()}, "make it")
+    assert run is None
+    assert note is not None
+    assert "the commit that gave the answers is unknown for 1 of 2 files, for example a.npz" in note
 
 
 def test_the_safe_default_has_a_bar_on_wrong_answers_of_the_accepted_ones(tmp_path):

@@ -7,6 +7,7 @@ import pytest
 pytest.importorskip("torch", reason="needs the extra `training`")
 
 from model_training.calibration import make  # after the skip
+from model_training.calibration.answer_code import code_of_answers
 from model_training.calibration.families import FAMILIES
 from model_training.calibration.fit import CalibrationData, pooled
 from service.confidence.features import FEATURES
@@ -187,3 +188,29 @@ def test_maps_and_answers_are_kept_and_questions_asked_anew_only_on_demand(work)
     assert len(work.built) == 3
     work.all_of(2)
     assert [row[2] for row in work.built[3:]] == ["one", "three-without-streets"]
+
+
+def test_stored_answers_name_the_version_of_the_code(work, monkeypatch):
+    """An older release did not keep it. A line of the command tells how many files are of another version."""
+    make.collected(work.folder, work.encoder, report=print)
+    codes = make.codes_of_answers(work.folder, work.encoder)
+    assert set(codes.values()) == {code_of_answers()}
+    assert len(codes) == 3 + len(FAMILIES) + 1
+    name = next(name for name in codes if name.startswith("asked-calibration-car-1-"))
+    with np.load(work.folder / name) as kept:
+        arrays = {field: kept[field] for field in CalibrationData.__dataclass_fields__}
+    np.savez_compressed(work.folder / name, **arrays)
+    assert {each for each, code in make.codes_of_answers(work.folder, work.encoder).items() if code is None} == {name}
+    monkeypatch.setattr(make, "fit", lambda *_, **__: "calibration")
+    monkeypatch.setattr(make, "cross_check", lambda *_, **__: [])
+    _, told = make.calibrate(work.folder, work.encoder, report=print)
+    assert told[-1].startswith(
+        f"1 of {len(codes)} files of answers in {work.folder} are of another version of the code; --anew"
+    )
+
+
+def test_answers_of_the_present_code_need_no_word(work, monkeypatch):
+    monkeypatch.setattr(make, "fit", lambda *_, **__: "calibration")
+    monkeypatch.setattr(make, "cross_check", lambda *_, **__: [])
+    _, told = make.calibrate(work.folder, work.encoder, report=print)
+    assert not any("another version" in line for line in told)
