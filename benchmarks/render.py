@@ -84,6 +84,8 @@ def _section(name: str, report: dict[str, Any]) -> list[str]:
             "",
             *(f"- {each}" for each in notes["missing"]),
         ]
+    if notes.get("left_out"):
+        lines += ["", "The last run left these recordings out:", "", *(f"- {each}" for each in notes["left_out"])]
     remarks = [f"- `{row['id']}`: {text}" for row in rows for text in _remarks(row)]
     lines += ["", *remarks, ""] if remarks else [""]
     picture = _plot(name, rows)

@@ -22,7 +22,7 @@ from benchmarks.kitti.protocol import (
     place_similarities,
 )
 from benchmarks.kitti.published import NOTE, PUBLISHED_R1
-from benchmarks.kitti.sources import LOOPS, OTHER_DAY, Drive, drives_below, missing
+from benchmarks.kitti.sources import LOOPS, OTHER_DAY, Drive, drives_below, left_out, missing
 from benchmarks.report import ROOT, Report
 from model_training.datasets.dataset import Dataset
 from model_training.importing.kinds import OpenSettings, open_recording
@@ -57,6 +57,8 @@ def main() -> None:
     for line in missing(drives):
         print(f"missing: {line}", flush=True)
     chosen = [drive for drive in drives if not arguments.only or drive.name in arguments.only]
+    for line in left_out(drives, chosen):
+        print(f"left out: {line}", flush=True)
     if not chosen:
         parser.error(
             f"--root: no drive to measure below {arguments.root}; found: {', '.join(d.name for d in drives) or 'none'}"
@@ -74,6 +76,7 @@ def main() -> None:
         if mapped in maps and asked in maps:
             _other_day(report, mapped, asked, shared, maps)
     report.notes["missing"] = missing(drives)
+    report.notes["left_out"] = left_out(drives, chosen) or None
     report.notes[NOTE] = {name: list(row) for name, row in PUBLISHED_R1.items()}
     print(report.write())
 

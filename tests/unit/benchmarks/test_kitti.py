@@ -6,7 +6,7 @@ import pytest
 from benchmarks.kitti import __main__ as bench
 from benchmarks.kitti.protocol import found_within, in_the_frame_of
 from benchmarks.kitti.published import NOTE, PUBLISHED_R1
-from benchmarks.kitti.sources import PUBLISHED, drives_below, missing
+from benchmarks.kitti.sources import PUBLISHED, Drive, drives_below, left_out, missing
 from benchmarks.report import Report
 from model_training.datasets.dataset import (
     CameraSensor,
@@ -173,3 +173,11 @@ def test_a_packed_drive_is_recognised(tmp_path):
     (raw / "velodyne_points/data/0000000000.xz").touch()
     (found,) = drives_below(tmp_path)
     assert (found.packed, found.folder) == (True, tmp_path / "kitti_0005")
+
+
+def test_a_recording_that_was_not_measured_is_named_with_the_reason(tmp_path):
+    drives = [Drive(name, "kitti-raw", tmp_path) for name in ("00", "05", "2011_09_26_drive_0013")]
+    told = left_out(drives, drives[:1])
+    assert told[0] == "05: not chosen by --only"
+    assert told[1].startswith("2011_09_26_drive_0013: it serves reports only and may be measured at most once a day")
+    assert left_out(drives, drives) == []

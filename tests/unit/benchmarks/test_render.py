@@ -108,6 +108,7 @@ def test_published_figures_stand_beside_ours_and_missing_recordings_are_listed()
         "notes": {
             NOTE: {"weak": [1, 2, 3, 4, 5, 6], "strong": [91, 92, 93, 94, 95, 96.5]},
             "missing": ["odometry sequence 00", "raw drive"],
+            "left_out": ["2011_drive: why"],
         },
     }
     lines = render._section("kitti", report)
@@ -125,6 +126,8 @@ def test_published_figures_stand_beside_ours_and_missing_recordings_are_listed()
     assert any("arXiv 2502.11742" in line for line in lines[:start])
     missing = lines.index("The machine of the last run lacks these recordings:")
     assert lines[missing + 2 : missing + 4] == ["- odometry sequence 00", "- raw drive"]
+    left_out = lines.index("The last run left these recordings out:")
+    assert lines[left_out + 2] == "- 2011_drive: why"
 
 
 def test_a_report_without_these_notes_has_neither():
