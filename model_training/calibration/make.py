@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -163,8 +164,8 @@ def _kept(
     if not kept.exists() or anew:
         work.mkdir(parents=True, exist_ok=True)
         data, part = pooled(ask()), kept.with_suffix(".part.npz")
-        arrays = {name: getattr(data, name) for name in CalibrationData.__dataclass_fields__}
-        np.savez_compressed(part, **arrays, **{_CODE: np.array(code_of_answers())})
+        arrays: dict[str, Any] = {name: getattr(data, name) for name in CalibrationData.__dataclass_fields__}
+        np.savez_compressed(part, **arrays | {_CODE: np.array(code_of_answers())})
         part.rename(kept)
 
     def read() -> CalibrationData:

@@ -113,7 +113,7 @@ def test_rows_of_older_answers_belong_to_the_oldest_commit_that_gave_them(monkey
     ages = {"a" * 40: "7", "b" * 40: "12"}
     monkeypatch.setattr(rigs, "commit_with_code", commits.get)
     monkeypatch.setattr(rigs, "git", lambda *arguments: ages[arguments[-1]])
-    codes = {"a.npz": "new", "b.npz": "old", "c.npz": code_of_answers()}
+    codes: dict[str, str | None] = {"a.npz": "new", "b.npz": "old", "c.npz": code_of_answers()}
     run, note = rigs.run_of_answers(codes, "make it")
     assert run is not None
     assert (run.commit, run.command, run.date) == ("a" * 40, "make it", None)
