@@ -69,12 +69,13 @@ def decide(
         return Decision("OUT_OF_MAP", 0.0, 0.0)
     confidence = float(calibration.confidence(evidence))
     known_odds = calibration.log_odds("known", evidence)
-    # A right answer is in the map, and the correction of a rig may raise the confidence above ``known``.
-    if calibration.rig is not None:
+    # A right answer is in the map, so ``known`` is at least the confidence. The correction of a rig may raise the confidence above it, and
+    # a prior would then lower the confidence (decision 0187).
+    if calibration.rig is not None or prior_nats > 0:
         known_odds = np.maximum(known_odds, np.log(confidence) - np.log1p(-confidence))
     unprompted, known = (float(odds) for odds in probability(np.array([known_odds, known_odds + prior_nats])))
     if prior_nats > 0:
-        confidence = confidence / max(unprompted, confidence) * known
+        confidence = min(confidence / unprompted, 1.0) * known
     if confidence >= calibration.threshold(false_accept_rate) and is_acceptable(
         calibration, evidence, false_accept_rate
     ):

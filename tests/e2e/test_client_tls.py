@@ -17,6 +17,7 @@ import uvicorn
 
 from model_training.loadtest.payloads import Payload
 from model_training.loadtest.targets import Grpc, Rest
+from service.bridge.known import Known
 from service.bridge.opening import _asking
 from service.bridge.settings import BridgeSettings
 from service.cli.main import main
@@ -304,10 +305,11 @@ def test_the_command_health(
 
 def test_the_bridge_asks_over_tls(faces: Faces, pem: Pem, pictures: Any, bundle_path: Path) -> None:
     right = BridgeSettings(url=faces["mutual"]["rest"], ca=pem["ca.crt"], cert=pem["robot.crt"], key=pem["robot.key"])
+    rgb, depth_m, camera = pictures
     with _asking(right) as localize:
-        assert localize(*pictures).status == "LOCALIZED"
+        assert localize(rgb, depth_m, camera, Known()).status == "LOCALIZED"
     with _asking(replace(right, ca=pem["other.crt"])) as localize, pytest.raises(HandshakeError):
-        localize(*pictures)
+        localize(rgb, depth_m, camera, Known())
     with pytest.raises(RequestError, match="--ca: it is only for a service"), _asking(replace(right, map=bundle_path)):
         pass
 

@@ -45,6 +45,20 @@ def test_the_first_difference_is_named(tmp_path, change, what):
         compare(written(tmp_path / "a" / "city"), written(tmp_path / "b" / "city", **change))
 
 
+def test_answers_that_a_change_alters_on_purpose_are_left_out_and_their_rows_are_not_covered(tmp_path):
+    one = written(tmp_path / "a" / "city", sets=("single", "right_prior"))
+    other = written(tmp_path / "b" / "city", sets=("single", "right_prior"))
+    np.savez(other / "answers" / "right_prior.npz", T_true=np.zeros((2, 4, 4)), status=np.array(["", ""]))
+    with pytest.raises(DifferentAnswersError, match="right_prior"):
+        compare(one, other)
+    files, rows = same_answers.CHANGED["priors"]
+    assert compare(one, other, files) == 2
+    found = same_answers.record("a", "b", {"city": 2}, "priors")["not_covered"]
+    assert found["accuracy"] == ["prior."]
+    assert set(rows["real_data"]) < set(found["real_data"])
+    assert "accuracy" not in same_answers.record("a", "b", {"city": 2})["not_covered"]
+
+
 def test_a_number_that_differs_in_its_last_bit_differs(tmp_path):
     with pytest.raises(DifferentAnswersError, match="confidence"):
         compare(

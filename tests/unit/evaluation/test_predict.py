@@ -80,7 +80,7 @@ def test_a_query_without_depth_is_unanswered(localizer, own_dataset):
 
 def test_a_set_without_truth_is_refused(localizer, own_dataset):
     (own_dataset.folder / "queries" / NAME / "poses.txt").unlink()
-    with pytest.raises(DatasetError, match=r"has no poses\.txt"):
+    with pytest.raises(DatasetError, match=r"poses\.txt"):
         predict(localizer, own_dataset, NAME)
 
 
