@@ -8,7 +8,10 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Callable, Mapping
 from contextlib import suppress
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -17,24 +20,28 @@ from benchmarks.report import ROOT, Report
 from benchmarks.runs import Runs
 from benchmarks.scale.town import watched_build
 from model_training.datasets.dataset import Dataset, scan_path, write_tum
+from model_training.loadtest.processes import descendants
 from model_training.mapping.build_tiled import build_tiled
 from model_training.mapping.engines import Engine
 from model_training.mapping.settings import BuildSettings
 from model_training.simulation.plan import SimulationPlan
 from model_training.stock import ENCODER
 from model_training.training.recipe import EVALUATION_SEEDS
-from service.maps.manifest import read_manifest
+from service.errors import RequestError
+from service.maps.manifest import Manifest, read_manifest
 
 #: Rows of this part and their units.
 BARRED = {"build.kill_runs_identical": "runs", "build.ray_over_local_throughput": "ratio"}
-#: Runs in which something is killed.
-RUNS = 20
+#: Runs in which something is killed, and most tries of a run: a try counts only if a process was really killed.
+RUNS, TRIES = 20, 20
 #: Rounds of each engine. The fastest one counts.
 ROUNDS = 2
 #: Towns of the comparison of memory, and the distance between them, metres.
 TOWNS, APART_M = 4, 2000.0
 #: Edge of the tiles of all these maps, metres.
 _TILE_M = 60.0
+#: Time between two looks at the processes of an undisturbed build, s.
+_LOOK_S = 0.05
 
 
 def built_rows(report: Report, runs: Runs) -> None:
@@ -59,60 +66,180 @@ def _plan(name: str, seed: int, size_m: tuple[float, float], streets: tuple[str,
     )
 
 
+@dataclass(frozen=True, slots=True)
+class Kill:
+    """What a run kills.
+
+    Attributes:
+        name: what it kills, for the report.
+        engine: engine of the build.
+        victims: returns the processes of a build from which one is drawn.
+        told: what the build says after the death of such a process; None if the build itself dies.
+    """
+
+    name: str
+    engine: Engine
+    victims: Callable[[int], list[int]]
+    told: str | None
+
+
+def kills() -> list[Kill]:
+    """Return what the runs kill in turn. Without Ray there is no worker of Ray."""
+    found = [
+        Kill("whole builds", "local", lambda build: [build], None),
+        Kill("tile processes", "local", lambda build: processes_with(build, b"spawn_main"), "was killed by SIGKILL"),
+    ]
+    if importlib.util.find_spec("ray") is not None:
+        worker = Kill(
+            "Ray workers", "ray", lambda build: processes_with(build, b"ray::_in_task"), "was lost (WorkerCrashedError)"
+        )
+        found.append(worker)
+    return found
+
+
 def _killed(report: Report, dataset: Dataset, work: Path) -> None:
-    """Kill a tile's process in every second run, and the whole build in the others. The next command goes on."""
+    """Kill a process in every run. A build that was killed itself is started again. The maps must have the same versions."""
     draw = random.Random(39)  # noqa: S311  # moments, not secrets
-    out = work / "killed"
+    out, log, chosen = work / "killed", work / "build.log", kills()
     shutil.rmtree(work, ignore_errors=True)
-    began = time.monotonic()
-    _finished(_started(dataset, out))
-    took_s = time.monotonic() - began
-    expected, same, restarted = read_manifest(out), 0, 0
+    work.mkdir(parents=True)
+    window_s = {}
+    for kill in reversed(chosen):  # the last build is a local one, whose map is expected
+        window_s[kill.name] = window_of(kill, _started_anew(dataset, out, kill.engine, log), log)
+    expected, same, in_vain = _versions(read_manifest(out)), 0, 0
+    killed = dict.fromkeys((kill.name for kill in chosen), 0)
     for number in range(RUNS):
-        shutil.rmtree(out)
-        process = _started(dataset, out)
-        time.sleep(draw.uniform(0.1, 0.95) * took_s)
-        victims = _tile_processes(process.pid) if number % 2 else [process.pid]
-        with suppress(ProcessLookupError):  # it has just ended
-            if victims:
-                os.kill(draw.choice(victims), signal.SIGKILL)
-        if process.wait() != 0:
-            restarted += 1
-            _finished(_started(dataset, out))
-        made = read_manifest(out)
-        tiles = [(tile.column, tile.row, tile.version) for tile in made.tiles]
-        alike = tiles == [(tile.column, tile.row, tile.version) for tile in expected.tiles]
-        same += alike and made.version == expected.version
+        kill = chosen[number % len(chosen)]
+        start = partial(_started_anew, dataset, out, kill.engine, log)
+        in_vain += killed_run(kill, start, log, draw, window_s[kill.name])
+        killed[kill.name] += 1
+        if kill.told is None:
+            require_success(_started(dataset, out, kill.engine, log), log)
+        same += _versions(read_manifest(out)) == expected
+    counts = ", ".join(f"{count} {name}" for name, count in killed.items())
     report.row(
         "build.kill_runs_identical",
         same,
         BARRED["build.kill_runs_identical"],
         bar=RUNS,
         n=RUNS,
-        why=f"{len(expected.tiles)} tiles; in {restarted} runs the whole build was killed and the command given again",
+        why=f"{len(expected) - 1} tiles; killed: {counts}. A build that was killed itself was started again. {in_vain} more tries found no "
+        "process to kill and do not count",
     )
     shutil.rmtree(work)
 
 
-def _started(dataset: Dataset, out: Path) -> subprocess.Popen[bytes]:
+def window_of(kill: Kill, process: subprocess.Popen[bytes], log: Path) -> tuple[float, float]:
+    """Wait for the end of an undisturbed build. Return the first and the last time at which it had a process to kill, s from its start.
+
+    Args:
+        kill: what would be killed.
+        process: the build, just started.
+        log: file with what the build says.
+
+    Raises:
+        RuntimeError: the build failed, or there was nothing to kill.
+    """
+    began, seen = time.monotonic(), []
+    while process.poll() is None:
+        with suppress(RequestError):  # it has just ended
+            if kill.victims(process.pid):
+                seen.append(time.monotonic() - began)
+        time.sleep(_LOOK_S)
+    require_success(process, log)
+    if not seen:
+        raise RuntimeError(f"{kill.name}: the build had none to kill; it may be too short, so choose a larger city")
+    return seen[0], seen[-1]
+
+
+def killed_run(
+    kill: Kill,
+    start: Callable[[], subprocess.Popen[bytes]],
+    log: Path,
+    draw: random.Random,
+    window_s: tuple[float, float],
+) -> int:
+    """Start a build, kill a process of it at a random moment, and wait for its end. Repeat this until a process was really killed.
+
+    Args:
+        kill: what is killed.
+        start: starts the build from the beginning.
+        log: file with what the build says.
+        draw: draws the moment and the process.
+        window_s: first and last time at which an undisturbed build has a process to kill, s from its start.
+
+    Returns:
+        Number of tries in which no process was killed, because there was none or it had ended.
+
+    Raises:
+        RuntimeError: nothing was killed in ``TRIES`` tries, or a build failed for another reason.
+    """
+    for in_vain in range(TRIES):
+        process = start()
+        try:
+            time.sleep(draw.uniform(*window_s))
+            victims = kill.victims(process.pid) if process.poll() is None else []
+            with suppress(ProcessLookupError):  # it has just ended
+                if victims:
+                    os.kill(draw.choice(victims), signal.SIGKILL)
+            code = process.wait()
+        finally:
+            process.kill()
+        if kill.told is None and code == -signal.SIGKILL:
+            return in_vain
+        require_success(process, log)
+        if kill.told is not None and kill.told in log.read_text(errors="replace"):
+            return in_vain
+    raise RuntimeError(
+        f"{kill.name}: nothing was killed in {TRIES} tries; the build may be too short, so choose a larger city"
+    )
+
+
+def _versions(made: Manifest) -> list[tuple[int, int, str]]:
+    """Return the version of each tile with its column and row, and that of the map."""
+    return [*((tile.column, tile.row, tile.version) for tile in made.tiles), (-1, -1, made.version)]
+
+
+def _started_anew(dataset: Dataset, out: Path, engine: Engine, log: Path) -> subprocess.Popen[bytes]:
+    shutil.rmtree(out, ignore_errors=True)
+    return _started(dataset, out, engine, log)
+
+
+def _started(dataset: Dataset, out: Path, engine: Engine, log: Path) -> subprocess.Popen[bytes]:
     command = [sys.executable, "-c", "from service.cli.start import main; main()", "build-map", str(dataset.folder)]
-    command += ["--out", str(out), "--headings", "6", "--tile-m", f"{_TILE_M:g}", "--workers", "2"]
-    return subprocess.Popen(command, cwd=ROOT, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    command += ["--out", str(out), "--headings", "6", "--tile-m", f"{_TILE_M:g}", "--workers", "2", "--engine", engine]
+    environment = {name: value for name, value in os.environ.items() if name != "RAY_ADDRESS"}
+    with log.open("wb") as stream:
+        return subprocess.Popen(command, cwd=ROOT, env=environment, stdout=subprocess.DEVNULL, stderr=stream)
 
 
-def _finished(process: subprocess.Popen[bytes]) -> None:
+def require_success(process: subprocess.Popen[bytes], log: Path) -> None:
+    """Wait for the end of a build.
+
+    Args:
+        process: the build.
+        log: file with what it says.
+
+    Raises:
+        RuntimeError: it failed.
+    """
     if process.wait() != 0:
-        raise RuntimeError(f"the build ended with code {process.returncode}: {process.args!r}")
+        raise RuntimeError(
+            f"the build ended with code {process.returncode}: {process.args!r}\n{log.read_text(errors='replace')[-2000:]}"
+        )
 
 
-def _tile_processes(parent: int) -> list[int]:
-    """Return the processes that build tiles for a process."""
+def processes_with(ancestor: int, text: bytes) -> list[int]:
+    """Return the descendants of a process whose command line has a text.
+
+    Args:
+        ancestor: number of the process.
+        text: part of the command line.
+    """
     found = []
-    for folder in Path("/proc").iterdir():
-        with suppress(OSError, ValueError):  # not a process, or one that has ended
-            pid = int(folder.name)
-            status = (folder / "stat").read_text().rpartition(")")[2].split()
-            if int(status[1]) == parent and b"spawn_main" in (folder / "cmdline").read_bytes():
+    for pid in descendants(ancestor) - {ancestor}:
+        with suppress(OSError):  # it has ended
+            if text in Path(f"/proc/{pid}/cmdline").read_bytes():
                 found.append(pid)
     return found
 
@@ -130,7 +257,7 @@ def _against_ray(report: Report, dataset: Dataset, work: Path) -> None:
     cores = len(os.sched_getaffinity(0))
     ray.init(address="local", num_cpus=cores, include_dashboard=False, log_to_driver=False)
     took: dict[Engine, list[float]] = {"local": [], "ray": []}
-    versions = set()
+    versions: dict[Engine, set[str]] = {"local": set(), "ray": set()}
     settings = BuildSettings(name=dataset.name)
     for _ in range(ROUNDS):
         for engine, times in took.items():
@@ -140,19 +267,33 @@ def _against_ray(report: Report, dataset: Dataset, work: Path) -> None:
                 dataset, ENCODER, work / engine, settings, tile_m=_TILE_M, engine=engine, workers=cores, warn=print
             )
             times.append(time.monotonic() - began)
-            versions.add(made.version)
+            versions[engine].add(made.version)
     ray.shutdown()
     shutil.rmtree(work)
+    require_one_version(versions)
     local_s, ray_s = min(took["local"]), min(took["ray"])
-    equal = "equal" if len(versions) == 1 else "DIFFERENT"
     report.row(
         row_id,
         local_s / ray_s,
         BARRED[row_id],
         bar=0.9,
         n=ROUNDS,
-        why=f"{local_s:.0f} s with processes, {ray_s:.0f} s with Ray, {len(made.tiles)} tiles, {cores} cores; versions are {equal}",
+        why=f"{local_s:.0f} s with processes, {ray_s:.0f} s with Ray, {len(made.tiles)} tiles, {cores} cores; all maps are equal",
     )
+
+
+def require_one_version(versions: Mapping[Engine, set[str]]) -> None:
+    """Refuse maps of different versions.
+
+    Args:
+        versions: versions of the maps that each engine built.
+
+    Raises:
+        RuntimeError: the versions differ. Then a comparison of the engines means nothing.
+    """
+    if len(set().union(*versions.values())) != 1:
+        told = "; ".join(f"{engine}: {', '.join(sorted(found))}" for engine, found in versions.items())
+        raise RuntimeError(f"the engines built different maps ({told}); find the cause before you compare their times")
 
 
 def four_towns_row(report: Report, town: Dataset, work: Path) -> None:
