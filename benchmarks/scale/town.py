@@ -1,11 +1,12 @@
-"""The town: 20 km of streets in a square kilometre, built in tiles, opened, and asked."""
+"""The town: 20 km of streets in a square kilometre, built in tiles, served, and asked."""
 
-import multiprocessing
 import subprocess
 import sys
 import time
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
-from multiprocessing.connection import Connection
+from itertools import islice
 from pathlib import Path
 
 import numpy as np
@@ -13,21 +14,22 @@ import numpy as np
 from benchmarks.plans import BOTH
 from benchmarks.report import ROOT, Report
 from benchmarks.runs import MAPPING, Runs, accepted_within, code_hash, pooled, prior_with_std, share, within
-from model_training.datasets.dataset import Dataset
+from benchmarks.serving.machines import Server, peak_mib
+from model_training.datasets.dataset import Dataset, QueryFrame
 from model_training.evaluation.measures import measure
 from model_training.simulation.plan import QueryPlan, SimulationPlan
 from model_training.training.recipe import EVALUATION_SEEDS
-from service.localization.localizer import Localizer
+from service.client import Client
+from service.contract.schema import Camera, LocalizeAnswer
 from service.maps.content import NOT_SERVED
 from service.maps.manifest import Manifest, read_manifest
-from service.maps.tiles import TiledMap, open_map
+from service.maps.tiles import TiledMap
 from service.retrieval.encoder import Encoder
-from service.runtime.engine import warm_up
 
 #: Extent of the town, m; queries with each depth camera; sequences of frames.
 TOWN_M, QUERIES, SEQUENCES, FRAMES = (1000.0, 1000.0), 500, 100, 5
-#: Edge of the tiles (m), limit of the open tiles under load (bytes), and queries of this load.
-TILE_M, OPEN_BYTES, LOAD = 500.0, 512 * 2**20, 150
+#: Edge of the tiles (m), limit of the open tiles under load (bytes), queries of this load, and clients that send them.
+TILE_M, OPEN_BYTES, LOAD, CLIENTS = 500.0, 512 * 2**20, 150, 4
 #: Time between two looks at the memory of a build, s.
 _LOOK_S = 1.0
 #: Standard deviation of a prior, metres: that of GNSS between houses.
@@ -76,7 +78,7 @@ def town_rows(report: Report, runs: Runs) -> None:
         why=f"{len(read.tiles)} tiles of {TILE_M:g} m, {metres / 1e3:.1f} km of streets; equal files, such as the encoder of each tile, "
         "are links to one file and count once",
     )
-    _open_rows(report, folder, dataset)
+    open_rows(report, folder, dataset)
     report.write()
     _accuracy_rows(report, runs, dataset, folder)
 
@@ -143,36 +145,59 @@ def served_bytes(folder: Path, read: Manifest) -> int:
     return sum(served.values())
 
 
-def _open_rows(report: Report, folder: Path, dataset: Dataset) -> None:
-    """Add time to ready and memory under load, each in a process of its own."""
-    spawn = multiprocessing.get_context("spawn")
-    receiving, sending = spawn.Pipe(duplex=False)
-    process = spawn.Process(target=_ask, args=(folder, dataset.folder, sending))
-    process.start()
-    sending.close()
-    try:
-        ready_s, resident = receiving.recv()
-    except EOFError as error:
-        raise RuntimeError("the process that asks the town has ended; its error is above") from error
-    process.join()
-    report.row("town.ready_s", ready_s, "s", bar=2, better="lower", why="open the map, and answer one random query")
-    why = f"after {LOAD} queries without a prior, at most {OPEN_BYTES / 2**20:.0f} MiB of open tiles"
-    report.row("town.resident_mib", resident / 2**20, "MiB", bar=1000, better="lower", n=LOAD, why=why)
+def open_rows(report: Report, folder: Path, dataset: Dataset) -> None:
+    """Add time to ready and peak memory under load, of the real command. The command is ended, also after an error.
+
+    Args:
+        report: collects the rows.
+        folder: folder of the map.
+        dataset: dataset with the queries.
+    """
+    frames = list(islice(dataset.queries("drive1_precise"), LOAD))
+    with Server(folder, core=None, workers=1, open_tile_bytes=OPEN_BYTES) as server:
+        answers = ask(server.url, frames, CLIENTS)
+        peak = peak_mib(server.process.pid)
+    why = "`streetfix serve` with one worker, from the start of the process until /readyz answers 200"
+    report.row("town.ready_s", server.ready_s, "s", bar=2, better="lower", why=why)
+    accepted = sum(answer.status == "LOCALIZED" for answer in answers)
+    report.row(
+        "town.resident_mib",
+        peak,
+        "MiB",
+        bar=1000,
+        better="lower",
+        n=len(answers),
+        why=f"VmHWM, the largest resident memory of the service since its start, with pages of the map. {len(answers)} queries without a "
+        f"prior from {CLIENTS} clients over REST, {accepted} of them LOCALIZED; at most {OPEN_BYTES / 2**20:.0f} MiB of tiles are open",
+    )
 
 
-def _ask(folder: Path, dataset: Path, sending: Connection) -> None:
-    began = time.monotonic()
-    opened = open_map(folder, open_bytes=OPEN_BYTES)
-    localizer = Localizer.open(opened)
-    warm_up(0.02, localizer)
-    ready_s = time.monotonic() - began
-    for number, frame in enumerate(Dataset(dataset).queries("drive1_precise")):
-        if number == LOAD:
-            break
-        localizer.localize(frame.query(opened.grid))
-    status = Path("/proc/self/status").read_text()
-    resident = 1024 * int(status.partition("VmRSS:")[2].split()[0])
-    sending.send((ready_s, resident))
+def ask(url: str, frames: Sequence[QueryFrame], clients: int) -> list[LocalizeAnswer]:
+    """Send queries without a prior from several clients at the same time; return the answers in the order of the queries.
+
+    Args:
+        url: address of the service.
+        frames: the queries.
+        clients: number of clients. Each waits for its answer before it sends the next query.
+
+    Raises:
+        StreetfixError: a query was not answered.
+    """
+
+    def one(frame: QueryFrame) -> LocalizeAnswer:
+        depth = frame.camera.depth
+        return client.localize(
+            frame.rgb_path.read_bytes(),
+            frame.depth_path.read_bytes(),
+            Camera(**frame.request()["camera"]),
+            depth_scale_m=depth.scale_m,
+            depth_kind=depth.kind,
+            max_range_m=depth.max_range_m,
+            baseline_m=depth.baseline_m,
+        )
+
+    with Client(url) as client, ThreadPoolExecutor(clients) as threads:
+        return list(threads.map(one, frames))
 
 
 def _accuracy_rows(report: Report, runs: Runs, dataset: Dataset, folder: Path) -> None:

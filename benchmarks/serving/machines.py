@@ -24,6 +24,8 @@ from service.errors import StreetfixError
 SERVED_CORE, LOADING_CORE = 0, 1
 #: Time after which a service that is not ready is ended, seconds.
 _READY_S = 300.0
+#: Time after which a service that does not stop is killed, seconds.
+_STOP_S = 120.0
 _CORES = os.sched_getaffinity(0) if hasattr(os, "sched_getaffinity") else set()
 _SERVE = [sys.executable, "-c", "from service.cli.main import main; main()", "serve"]
 
@@ -115,6 +117,10 @@ class Server:
             kill_tree(self.process.pid)
             self.wait()
             raise RuntimeError(f"the service ended before it was ready: {error!r}") from error
+        except BaseException:  # for example Ctrl-C: nobody else would end it
+            kill_tree(self.process.pid)
+            self.wait()
+            raise
         finally:
             late.cancel()
         self.ready_s = time.perf_counter() - began
@@ -126,10 +132,19 @@ class Server:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """Stop the service."""
+        """Stop the service. If it does not stop, it is killed.
+
+        Raises:
+            subprocess.TimeoutExpired: it did not stop by itself.
+        """
         if self.process.poll() is None:
             self.process.send_signal(signal.SIGTERM)
-        self.wait(120)
+        try:
+            self.wait(_STOP_S)
+        except BaseException:
+            kill_tree(self.process.pid)
+            self.wait()
+            raise
 
     def wait(self, timeout_s: float | None = None) -> int:
         """Wait for the end of the service and of its log; return its exit code.
@@ -256,6 +271,25 @@ def proportional_mib(pid: int) -> float:
     if found is None:
         raise RuntimeError(f"/proc/{pid}/smaps_rollup has no Pss")
     return int(found[1]) / 1024
+
+
+def peak_mib(pid: int) -> float:
+    """Return the largest resident memory of a process since its start, MiB (``VmHWM``), summed over it and its descendants.
+
+    Args:
+        pid: the process.
+
+    Raises:
+        RequestError: there is no such process.
+        RuntimeError: the system does not report VmHWM.
+    """
+    total = 0.0
+    for each in descendants(pid):
+        found = re.search(r"^VmHWM:\s+(\d+) kB$", Path(f"/proc/{each}/status").read_text(), re.MULTILINE)
+        if found is None:
+            raise RuntimeError(f"/proc/{each}/status has no VmHWM")
+        total += int(found[1]) / 1024
+    return total
 
 
 @dataclass(frozen=True, slots=True)
