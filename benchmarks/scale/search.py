@@ -176,7 +176,7 @@ def _tiled_rows(report: Report, ready: list[ReadyTiles]) -> dict[str, float]:
             "ms",
             n=QUERIES,
             why=f"{tiles}: {found.choose_ms:.1f} ms to choose them and put them together, {found.compare_ms:.1f} ms to scan and compare; "
-            f"{_tile_text()}",
+            f"default options of a query; {_tile_text()}",
         )
         why = f"of the ten best views of the whole map; {tiles}"
         report.row(f"{each.row}_recall_at_10", found.recall, "share", n=QUERIES, why=why)

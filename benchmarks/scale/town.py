@@ -1,5 +1,6 @@
 """The town: 20 km of streets in a square kilometre, built in tiles, served, and asked."""
 
+import os
 import subprocess
 import sys
 import time
@@ -86,6 +87,14 @@ def town_rows(report: Report, runs: Runs) -> None:
 def _build(report: Report, dataset: Dataset, out: Path) -> None:
     minutes, peak = watched_build(dataset, out, "--name", "town", tile_m=TILE_M)
     report.row("town.build_minutes", minutes, "min", bar=12, better="lower", n=len(dataset.survey_poses()))
+    read, cores = read_manifest(out), len(os.sched_getaffinity(0))
+    km = read.counts.places * read.spacing_m / 1e3
+    report.row(
+        "town.build_core_hours_per_km",
+        minutes / 60 * cores / km,
+        "h/km",
+        why=f"at most: all {cores} cores count as busy",
+    )
     report.row("town.build_peak_gib", peak / 2**30, "GiB", bar=2, better="lower")
 
 
