@@ -7,11 +7,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from model_training.calibration.additive import Penalty, fit_additive
-from model_training.calibration.bounds import upper_bound, upper_bounds
+from model_training.calibration.bounds import bounded_thresholds
 from service.confidence.features import FEATURES, TABLE, Feature
 from service.errors import DatasetError
 from service.maps.calibration import Calibration, FeatureStatistics, Threshold, probability
-from service.option_limits import FALSE_ACCEPT_RATE, SAFE_CONFIDENCE
 
 #: False-accept rates with a threshold.
 RATES = (0.001, 0.002, 0.003, 0.005, 0.01, 0.02, 0.03, 0.05, 0.1)
@@ -181,10 +180,8 @@ def weights_of(data: CalibrationData) -> NDArray[np.float64]:
 def thresholds_of(data: CalibrationData, confidence: NDArray[np.float64]) -> tuple[Threshold, ...]:
     """Return for each rate the least confidence at which the false-accept rate is at most this, with certainty ``bounds.SURE``.
 
-    The bound of Clopper and Pearson (Biometrika 1934) covers the finite number of out-of-map queries. Another city, removed streets,
-    walls and rooms have equal weight (decision 0039), so the number of queries is the effective one of Kish (Survey Sampling, 1965).
-    Rates that the data cannot support have no threshold. At the default rate and below it, the threshold is at least
-    ``SAFE_CONFIDENCE``.
+    The bound of ``bounded_thresholds`` covers the finite number of out-of-map queries. Another city, removed streets, walls and rooms
+    have equal weight (decision 0039). Rates that the data cannot support have no threshold.
 
     Args:
         data: the calibration data.
@@ -197,25 +194,14 @@ def thresholds_of(data: CalibrationData, confidence: NDArray[np.float64]) -> tup
     kinds = np.array([out_of_map_kind(str(kind)) for kind in data.kind[outside]])
     _, number, counts = np.unique(kinds, return_inverse=True, return_counts=True)
     weight = 1.0 / (len(counts) * counts[number])
-    effective = 1.0 / float((weight**2).sum())
-    order = np.argsort(-confidence[outside], kind="stable")
-    ranked, passed = confidence[outside][order], np.cumsum(weight[order])
-    bound = upper_bounds(passed * effective, effective)
-    found = []
-    for rate in RATES:
-        if upper_bound(0, effective) > rate:
-            continue
-        first_refused = min(int(np.searchsorted(bound, rate * (1 + 1e-9), side="right")), len(ranked) - 1)
-        level = float(min(1.0, np.nextafter(ranked[first_refused], 2.0)))
-        if rate <= FALSE_ACCEPT_RATE:
-            level = max(level, SAFE_CONFIDENCE)
-        found.append(Threshold(false_accept_rate=rate, confidence=level))
+    found = bounded_thresholds(confidence[outside], weight, RATES)
     if not found:
+        effective = 1.0 / float((weight**2).sum())
         raise DatasetError(
             f"calibration has {effective:.0f} effective out-of-map queries, which support no false-accept rate of "
             f"{RATES[-1]:g} or less; send more queries from outside the map", field="queries",
         )  # fmt: skip
-    return tuple(found)
+    return found
 
 
 def out_of_map_kind(kind: str) -> str:
