@@ -128,14 +128,14 @@ def merge(
     Example:
       streetfix map merge maps/north maps/south --out maps/town
     """
-    rigs = [_rig_of(each) for each in (first, second)]
+    rigs = [_rigs_of(each) for each in (first, second)]
     merging = merge_tiled if read_manifest(first).tiles else merge_maps
     with bars() as report:
         made = merging(first, second, out, name=name, overwrite=overwrite, report=report)
     Console().print(f"{describe(made)}: {out}")
     if rigs[0] != rigs[1]:
         Console(soft_wrap=True).print(
-            f"confidence: the two maps have different corrections for a rig, so the new map has none; run "
+            "confidence: the two maps have different corrections for rigs, and the new map has only those of both; run "
             f"`streetfix calibrate --map {out} --drive DATASET`"
         )
 
@@ -268,9 +268,10 @@ def _copied_text(copied: Copied) -> str:
     return f"map {manifest.name}, version {manifest.version}, {copied.size / 1e6:.1f} MB copied{tiles}"
 
 
-def _rig_of(bundle: Path) -> RigCorrection | None:
+def _rigs_of(bundle: Path) -> list[RigCorrection | None]:
+    """Return the correction of an earlier release, None if there is none, and those with a rig."""
     calibration = open_map(bundle, verify=False).calibration
-    return None if calibration is None else calibration.rig
+    return [None] if calibration is None else [calibration.rig, *calibration.rigs]
 
 
 def _info_lines(found: dict[str, Any]) -> list[str]:
@@ -279,7 +280,9 @@ def _info_lines(found: dict[str, Any]) -> list[str]:
     site = found["site"]
     checked = "" if site is None else f", {site['right']} of {site['queries']} right in the site check"
     rig = found["rig"]
-    checked += "" if rig is None else f", corrected for a rig by {rig['frames']} frames ({rig['measured_on']})"
+    checked += "" if rig is None else f", corrected for every rig by {rig['frames']} frames ({rig['measured_on']})"
+    for each in found["rigs"]:
+        checked += f", corrected for {each['name']} by {each['frames']} frames ({each['measured_on']})"
     return [
         f"map {found['name']}, version {found['version']}, made {found['made_at']}, {found['size_bytes'] / 1e6:.1f} MB",
         f"places:      {counts['places']}, {found['spacing_m']:g} m apart, x {low[0]:g} to {high[0]:g} m, y {low[1]:g} to {high[1]:g} m",

@@ -43,15 +43,15 @@ def calibration_for(path: Path | None, encoder_sha256: str) -> Calibration | Non
 def renew_calibration(folder: Path, path: Path) -> tuple[Manifest, bool]:
     """Replace the calibration of a map by that of a file, atomically. The map keeps its site check.
 
-    The old calibration may be of another release: only its site check is read. A correction for a rig is removed, because it was learned
-    on the old confidence.
+    The old calibration may be of another release: only its site check is read. Corrections for rigs are removed, because they were
+    learned on the old confidence.
 
     Args:
         folder: the map bundle or tiled map.
         path: the calibration file.
 
     Returns:
-        The new manifest, and whether a correction for a rig was removed.
+        The new manifest, and whether corrections for rigs were removed.
 
     Raises:
         DatasetError: the file cannot be read.
@@ -65,16 +65,17 @@ def renew_calibration(folder: Path, path: Path) -> tuple[Manifest, bool]:
             "for this encoder", field="calibration",
         )  # fmt: skip
     site, had_rig = _site_of(folder / CALIBRATION_FILE)
-    renewed = calibration.model_copy(update={"site": site, "rig": None})
+    renewed = calibration.model_copy(update={"site": site, "rig": None, "rigs": ()})
     return replace_calibration(folder, renewed.model_dump(mode="json")), had_rig
 
 
 def _site_of(path: Path) -> tuple[Site | None, bool]:
-    """Return the site check of a stored calibration, None if there is none, and whether it has a correction for a rig."""
+    """Return the site check of a stored calibration, None if there is none, and whether it has corrections for rigs."""
     try:
         content = json.loads(path.read_bytes())
         site = content.get("site")
-        return None if site is None else Site.model_validate(site), content.get("rig") is not None
+        had_rig = content.get("rig") is not None or bool(content.get("rigs"))
+        return None if site is None else Site.model_validate(site), had_rig
     except OSError as error:
         raise BundleError(
             f"{path} cannot be read ({error.strerror}); build the map again", field=CALIBRATION_FILE

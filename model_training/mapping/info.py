@@ -29,7 +29,7 @@ def info_of(path: Path) -> dict[str, Any]:
     streets = streets_of_bundle(bundle) or {"features": []}
     names = {feature["properties"]["street"]: feature["properties"]["name"] for feature in streets["features"]}
     calibration = bundle.calibration
-    site, rig = (None, None) if calibration is None else (calibration.site, calibration.rig)
+    site, rig, rigs = (None, None, ()) if calibration is None else (calibration.site, calibration.rig, calibration.rigs)
     return {
         "name": manifest.name,
         "version": manifest.version,
@@ -55,6 +55,7 @@ def info_of(path: Path) -> dict[str, Any]:
         "calibrated": calibration is not None,
         "site": None if site is None else site.model_dump(),
         "rig": None if rig is None else rig.model_dump(),
+        "rigs": [each.model_dump() for each in rigs],
         "keeps_sums": all(parts.STATISTICS_FILE in each.files for each in _bundles(path, manifest)),
         "licence": manifest.licence,
         "tool_versions": manifest.tool_versions,

@@ -205,7 +205,7 @@ def joined_streets(
 def joined_calibration(a: Mapping[str, Any], b: Mapping[str, Any]) -> dict[str, Any]:
     """Join two calibrations with their site checks; the result is uncalibrated if one of them is.
 
-    A correction for a rig stays only if both have the same one. It was learned on one of the maps only.
+    A correction for a rig stays only if both have the same one. Any other was learned on one of the maps only.
 
     Args:
         a: content of ``calibration.json``.
@@ -216,12 +216,14 @@ def joined_calibration(a: Mapping[str, Any], b: Mapping[str, Any]) -> dict[str, 
     """
     if not a["calibrated"] or not b["calibrated"]:
         return dict(b if a["calibrated"] else a)
-    own = {"site": None, "rig": None}
+    own = {"site": None, "rig": None, "rigs": None}
     if json.dumps({**a, **own}, sort_keys=True) != json.dumps({**b, **own}, sort_keys=True):
         raise BundleError(
             "calibration: the maps have different ones; build one of them again with the other's --calibration",
             field="calibration",
         )
+    both = [each for each in a.get("rigs", ()) if each in b.get("rigs", ())]
+    a = {name: value for name, value in a.items() if name != "rigs"} | ({"rigs": both} if both else {})
     a = {**a, "rig": a.get("rig") if a.get("rig") == b.get("rig") else None}
     sites = [site for site in (a.get("site"), b.get("site")) if site is not None]
     if len(sites) < 2:

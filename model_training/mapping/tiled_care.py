@@ -74,7 +74,7 @@ def merge_tiled(
     """Merge two tiled maps into a new one; return its manifest.
 
     A square that only one map has keeps its tile. Where both have a tile, ``merge_maps`` merges the two, unless they are the same. A
-    correction for a rig stays if both maps have it.
+    correction for a rig stays if both maps have the same.
 
     Args:
         first: folder of a tiled map.
@@ -105,9 +105,18 @@ def merge_tiled(
             else:
                 folders[square] = first / one[square].folder if square in one else second / two[square].folder
             report("merge", number, len(squares))
-        rigs = [None if each is None else each.rig for each in (_calibration_of(first), _calibration_of(second))]
-        rig = rigs[0] if rigs[0] == rigs[1] else None
-        return write_tiled(out, folders, read.tile_m or 0.0, name=name or read.name, overwrite=overwrite, rig=rig)
+        corrected = _with_common(_calibration_of(first), _calibration_of(second))
+        return write_tiled(
+            out, folders, read.tile_m or 0.0, name=name or read.name, overwrite=overwrite, corrected=corrected
+        )
+
+
+def _with_common(one: Calibration | None, other: Calibration | None) -> Calibration | None:
+    """Return a calibration with the corrections for rigs that it has in common with another one."""
+    if one is None or other is None:
+        return None
+    both = tuple(each for each in one.rigs if each in other.rigs)
+    return one.model_copy(update={"rig": one.rig if one.rig == other.rig else None, "rigs": both})
 
 
 def _calibration_of(path: Path) -> Calibration | None:

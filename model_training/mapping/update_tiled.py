@@ -120,9 +120,10 @@ def update_tiled(
             folders[_square(part)] = tile.updated(work.folder, progress)
             progress.finished(part)
         left = {square: folder for square, folder in folders.items() if folder is not None}
-        rig = None if whole.calibration is None else whole.calibration.rig
         report("joining tiles", 0, 1)
-        manifest = write_tiled(out, left, tile_m, name=whole.manifest.name, overwrite=overwrite, rig=rig)
+        manifest = write_tiled(
+            out, left, tile_m, name=whole.manifest.name, overwrite=overwrite, corrected=whole.calibration
+        )
         report("joining tiles", 1, 1)
         return manifest
 

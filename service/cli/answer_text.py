@@ -85,6 +85,8 @@ def _facts(answer: dict[str, Any]) -> list[tuple[str, str]]:
     status = ("status", answer["status"] + ("" if confidence is None else f" (confidence {confidence:.3f}{least})"))
     outside = ", ".join(f"{name} {size:+.1f}" for name, size in answer.get("extrapolated", {}).items())
     calibrated = [("calibration", f"extrapolated (standard deviations from the mean: {outside})")] if outside else []
+    rig = answer.get("rig_correction")  # an older service sends none
+    calibrated += [] if rig is None else [("rig", f"confidence corrected for {rig}")]
     version = ("map", f"{place['name']}, version {place['version']}")
     given = answer.get("camera_height")  # an older service sends none
     height = [] if given is None else [("camera", _height(given))]

@@ -116,6 +116,7 @@ def answer_of(message: pb.LocalizeResponse) -> schema.LocalizeAnswer:
             }
             if message.HasField("threshold")
             else None,
+            "rig_correction": message.rig_correction if message.HasField("rig_correction") else None,
             "belief": _belief_content(message.belief) if message.HasField("belief") else None,
             "map": {"name": message.map.name, "version": message.map.version},
             "timings_ms": {

@@ -1,5 +1,6 @@
 """Decision: the status and the calibrated confidence of an answer; reasons and spread if it is not LOCALIZED."""
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Literal
 
@@ -43,6 +44,18 @@ class Decision:
     known: float
 
 
+def calibration_for(calibration: Calibration | None, queries: Iterable[Query]) -> Calibration | None:
+    """Return the calibration for a query: with the correction for its rig, if the map has one.
+
+    Args:
+        calibration: calibration of the map; None returns None.
+        queries: image pairs of the query, the reference first.
+    """
+    if calibration is None or not calibration.rigs:
+        return calibration
+    return calibration.for_rigs(query.rig for query in queries)
+
+
 def decide(
     calibration: Calibration,
     evidence: Float64[NDArray[np.float64], " F"] | None,
@@ -57,7 +70,7 @@ def decide(
     right place of the map does not change: confidence is P(known) P(right | known).
 
     Args:
-        calibration: calibration of the map.
+        calibration: calibration for the query, as from ``calibration_for``.
         evidence: confidence features of the answer; None if the images have too few points to register.
         false_accept_rate: largest tolerated share of out-of-map queries that become LOCALIZED, 0 to 1. It holds without a prior.
         prior_nats: increase of the log odds of being in the map by a prior that agrees with the answer (``Prior.known_nats``).
@@ -124,6 +137,7 @@ class Outcome:
         spread: mean and covariance over all places where the camera may be; None for a LOCALIZED answer.
         extrapolated: confidence features outside the range of the calibration data, as from ``extrapolation.extrapolated``.
         threshold: the threshold that decided, with its false-accept rate; None if ``confidence`` is None.
+        rig_correction: name of the correction for a rig that the confidence has; None without one.
     """
 
     status: Status
@@ -133,6 +147,7 @@ class Outcome:
     spread: Spread | None
     extrapolated: tuple[tuple[str, float], ...] = ()
     threshold: Threshold | None = None
+    rig_correction: str | None = None
 
 
 def decision_of(
@@ -144,7 +159,7 @@ def decision_of(
     """Decide about an answer, with the prior and the false-accept rate of its query.
 
     Args:
-        calibration: calibration of the map; None if the map has none, or if the query requested no registration.
+        calibration: calibration for the query; None if the map has none, or if the query requested no registration.
         query: the reference.
         refined: registered candidates; None if nothing was registered, or if the images have too few points.
         evidence: confidence features, in the order of ``service.confidence.features.FEATURES``; None without ``refined``.
@@ -174,7 +189,7 @@ def outcome_of(
     """Compute reasons and spread of an answer from its decision.
 
     Args:
-        calibration: calibration of the map; None if the map has none, or if the query requested no registration.
+        calibration: calibration for the query; None if the map has none, or if the query requested no registration.
         query: the reference; its false-accept rate counts.
         refined: registered candidates; None if nothing was registered, or if the images have too few points.
         evidence: confidence features, in the order of ``service.confidence.features.FEATURES``; None without ``refined``.
@@ -186,28 +201,40 @@ def outcome_of(
     if calibration is None or decision is None:
         return Outcome("LOCALIZED", None, (), candidates, None)
     outside, threshold = extrapolated(calibration, evidence), calibration.threshold_at(query.false_accept_rate)
+    rig = None if calibration.rig is None else calibration.rig.name
     if decision.status == "LOCALIZED":
-        return Outcome(decision.status, decision.confidence, (), candidates, None, outside, threshold)
+        return Outcome(decision.status, decision.confidence, (), candidates, None, outside, threshold, rig)
     candidates = None if refined is None else refined.with_covariances()
     spread = _spread_over(candidates or (), frames, decision.confidence, extent)
     reasons = reasons_of(calibration, evidence, query.depth_m)
-    return Outcome(decision.status, decision.confidence, reasons, candidates, spread, outside, threshold)
+    return Outcome(decision.status, decision.confidence, reasons, candidates, spread, outside, threshold, rig)
 
 
 def require_promise(calibration: Calibration | None, query: Query) -> None:
     """Refuse a false-accept rate that the calibration data cannot support.
 
+    If the recording of the query's rig set thresholds, they decide about a rate that the request names. The default rate belongs to all
+    rigs of the service. Such a query is answered, by the stricter of both thresholds (``Calibration.threshold_at``).
+
     Args:
-        calibration: calibration of the map; None supports every rate.
+        calibration: calibration for the query, as from ``calibration_for``; None supports every rate.
         query: query with its false-accept rate.
 
     Raises:
         RequestError: the rate is lower than the calibration supports.
     """
-    if calibration is not None and query.false_accept_rate < calibration.least_false_accept_rate:
+    if calibration is None:
+        return
+    least, what = calibration.least_false_accept_rate, "the calibration of this map supports"
+    of_rig = calibration.least_rate_of_rig if query.rate_is_named else None
+    if of_rig is not None and calibration.rig is not None:
+        least, what = (
+            of_rig,
+            f"the recording of this rig supports ({calibration.rig.name}, {calibration.rig.outside} out-of-map frames)",
+        )
+    if query.false_accept_rate < least:
         raise RequestError(
-            f"options.false_accept_rate: {query.false_accept_rate:g} is below what the calibration of this map supports; "
-            f"send {calibration.least_false_accept_rate:g} or more",
+            f"options.false_accept_rate: {query.false_accept_rate:g} is below what {what}; send {least:g} or more",
             field="options.false_accept_rate",
         )
 

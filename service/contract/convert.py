@@ -281,6 +281,7 @@ def answer_from(located: Located) -> schema.LocalizeAnswer:
         else schema.AcceptanceThreshold(
             confidence=answer.threshold.confidence, false_accept_rate=answer.threshold.false_accept_rate
         ),
+        rig_correction=answer.rig_correction,
         belief=None if answer.belief is None else _belief(answer.belief, answer.epoch, located.sealed_belief),
         map=schema.MapVersion(name=bundle.name, version=bundle.manifest.version),
         timings_ms=schema.TimingsMs(

@@ -278,7 +278,7 @@ class Options(_Strict):
         ge=LEAST_FALSE_ACCEPT_RATE,
         lt=1,
         description="tolerated share of out-of-map queries with status LOCALIZED. The service refuses a share below the least "
-        "that the map's calibration measured. Default: the service's setting",
+        "that the map's calibration measured, or below the least that the recording of this rig supports. Default: the service's setting",
     )
 
 
@@ -604,8 +604,9 @@ class AcceptanceThreshold(BaseModel):
         gt=0,
         lt=1,
         description="upper bound (95 %, Clopper and Pearson) of the share of out-of-map queries that reach this confidence, "
-        "from the calibration data. It may be lower than the requested rate: calibration measured some rates only. It holds for a "
-        "query without a track",
+        "from the calibration data, or from a recording of this rig (rig_correction). It may be lower than the requested rate: calibration "
+        "measured some rates only. It may be higher if the request named no rate, and the recording does not support the service's. It "
+        "holds for a query without a track",
     )
 
 
@@ -698,6 +699,11 @@ class LocalizeAnswer(BaseModel):
     threshold: AcceptanceThreshold | None = Field(
         None,  # an earlier service sends none
         description="the threshold that decided the status. Null if confidence is null",
+    )
+    rig_correction: str | None = Field(
+        None,  # an earlier service sends none
+        description="name of the correction for a rig that the confidence has. Null if the map has none for the rig of this query, or "
+        "if confidence is null",
     )
     belief: Belief | None = Field(
         None,  # an earlier service sends none

@@ -72,8 +72,9 @@ def check_calibration(bundle: Map, false_accept_rate: float) -> Finding:
             f"set STREETFIX_FALSE_ACCEPT_RATE to {least:g} or more",
         )
     site = "not corrected for this site" if calibration.site is None else "corrected for this site"
-    rig = "" if calibration.rig is None else f", and for a rig ({calibration.rig.measured_on})"
-    return Finding("calibration", "ok", f"the map is calibrated, {site}{rig}")
+    rig = "" if calibration.rig is None else f", and for every rig ({calibration.rig.measured_on})"
+    rigs = "".join(f", and for {each.name} ({each.measured_on})" for each in calibration.rigs)
+    return Finding("calibration", "ok", f"the map is calibrated, {site}{rig}{rigs}")
 
 
 def check_cloud(bundle: Map) -> Finding:

@@ -102,7 +102,8 @@ def check_answer(pair: Pair, localizer: Localizer, false_accept_rate: float) -> 
     except StreetfixError as error:
         return Finding.of_error("answer", error)
     confidence = "no confidence" if answer.confidence is None else f"confidence {answer.confidence:.3f}"
-    text = f"{answer.status} ({confidence})"
+    rig = "" if answer.rig_correction is None else f", with the correction for {answer.rig_correction}"
+    text = f"{answer.status} ({confidence}{rig})"
     if answer.status == "LOCALIZED":
         if answer.extrapolated:
             outside = ", ".join(f"{name} {size:+.1f}" for name, size in answer.extrapolated)

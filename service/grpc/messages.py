@@ -251,6 +251,7 @@ def answer_message(answer: schema.LocalizeAnswer) -> pb.LocalizeResponse:
         else pb.AcceptanceThreshold(
             confidence=answer.threshold.confidence, false_accept_rate=answer.threshold.false_accept_rate
         ),
+        rig_correction=answer.rig_correction,
         belief=None if answer.belief is None else _belief(answer.belief),
     )
     return message

@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float64
 from numpy.typing import NDArray
 
-from service.confidence.decision import Decision, decision_of, extrapolated, is_acceptable, share_of
+from service.confidence.decision import Decision, calibration_for, decision_of, extrapolated, is_acceptable, share_of
 from service.geometry.rigid import Transform, inverse, nearest_rigid
 from service.localization.belief import Belief, FrameCandidate, agrees, sighting_of
 from service.localization.compose import QueryResult
@@ -45,17 +45,18 @@ def registered(register: Register, calibration: Calibration | None, frames: tupl
         RequestError: the calibration does not support such a low false-accept rate.
     """
     together = register(frames, ())
-    if calibration is None or len(frames) < 2 or not is_likely(calibration, frames[0], together):
+    of_query = calibration_for(calibration, (frame.query for frame in frames))
+    if calibration is None or of_query is None or len(frames) < 2 or not is_likely(of_query, frames[0], together):
         return together
     belief = _belief_of(register, calibration, frames)
-    decision = agreed(calibration, belief, frames[0].query.false_accept_rate)
+    decision = agreed(of_query, belief, frames[0].query.false_accept_rate)
     if decision is None or together.refined is None or together.evidence is None:
         return together
     if not agrees(belief.modes[0], together.refined.best.T_map_camera):
         return together
     # A perceptual alias moves with the robot, so single frames may agree on it. The rivals of all frames together are more complete.
     confidence = decision.confidence * share_of(together.evidence)
-    if confidence < calibration.threshold(frames[0].query.false_accept_rate):
+    if confidence < of_query.threshold(frames[0].query.false_accept_rate):
         return together
     return replace(together, decision=replace(decision, confidence=confidence))
 
@@ -64,7 +65,7 @@ def is_likely(calibration: Calibration, reference: EncodedFrame, found: QueryRes
     """Return whether a pose is not LOCALIZED, but may become so if the frames agree: it has the majority, and lies in range.
 
     Args:
-        calibration: of the map.
+        calibration: for the query.
         reference: its false-accept rate counts.
         found: result of several frames together.
     """
@@ -78,7 +79,7 @@ def agreed(calibration: Calibration, belief: Belief, false_accept_rate: float) -
     """Return the decision for the heaviest mode of a belief; None if it does not suffice, or the newest frame is not at it.
 
     Args:
-        calibration: of the map.
+        calibration: for the query, as from ``calibration_for``.
         belief: after the newest frame.
         false_accept_rate: of the query.
     """
@@ -99,7 +100,7 @@ def updated_belief(calibration: Calibration | None, frame: EncodedFrame, alone: 
         alone: result of this frame alone.
         belief: before the frame, moved to it.
     """
-    decision = alone.decision
+    decision, calibration = alone.decision, calibration_for(calibration, (frame.query,))
     if alone.refined is None or calibration is None or decision is None:
         return belief.unseen()
     if frame.query.false_accept_rate <= FALSE_ACCEPT_RATE and extrapolated(calibration, alone.evidence):
@@ -130,14 +131,16 @@ def frame_candidate_of(
 def _belief_of(register: Register, calibration: Calibration, frames: tuple[EncodedFrame, ...]) -> Belief:
     """Return the belief after all frames, each registered alone: the last one of the request first, the reference last.
 
-    Only the reference has a prior, and only its options count. The prior counts in the answer of all frames together.
+    Only the reference has a prior, and only its options count. The prior counts in the answer of all frames together. That answer also
+    checked the rate for the rig of the query, so a single frame is not refused.
     """
     reference, belief, before = frames[0].query, Belief(), None
     for frame in reversed(frames):
         if before is not None:
             belief = belief.moved(nearest_rigid(inverse(before) @ frame.T_reference_camera))
         before = frame.T_reference_camera
-        query = replace(frame.query, prior=None, refine=True, false_accept_rate=reference.false_accept_rate)
+        rate = reference.false_accept_rate
+        query = replace(frame.query, prior=None, refine=True, false_accept_rate=rate, rate_is_named=False)
         single = replace(frame, query=query, T_reference_camera=np.eye(4))
         alone = register((single,), tuple(mode.T_map_camera for mode in belief.modes[:PREDICTED]))
         with stage("register"):

@@ -82,6 +82,7 @@ class Answer:
         timings: duration of each stage.
         belief: belief of a track after this frame; None without a track, and if ``confidence`` is None.
         epoch: number of disruptions of the track; 0 without a track.
+        rig_correction: name of the correction for a rig that the confidence has; None without one.
     """
 
     status: Status
@@ -106,6 +107,7 @@ class Answer:
     timings: Timings
     belief: Belief | None = None
     epoch: int = 0
+    rig_correction: str | None = None
 
 
 def require_finite(answer: Answer) -> None:

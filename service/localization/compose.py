@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float64
 from numpy.typing import NDArray
 
-from service.confidence.decision import Decision, outcome_of
+from service.confidence.decision import Decision, calibration_for, outcome_of
 from service.confidence.spread import Extent
 from service.geometry.rigid import Transform, inverse, transform_from
 from service.localization.answer import Answer, Timings, require_finite
@@ -52,7 +52,8 @@ def compose(bundle: Map, frames: tuple[EncodedFrame, ...], found: QueryResult, e
     """
     retrieved, refined, evidence, decision = found.retrieved, found.refined, found.evidence, found.decision
     with stage("register"):  # reasons and spread count as registration
-        calibration = None if decision is None else bundle.calibration
+        queries = (frame.query for frame in frames)
+        calibration = None if decision is None else calibration_for(bundle.calibration, queries)
         outcome = outcome_of(
             calibration, frames[0].query, refined, evidence, decision, frames=len(frames), extent=extent
         )
@@ -71,6 +72,7 @@ def compose(bundle: Map, frames: tuple[EncodedFrame, ...], found: QueryResult, e
         reasons=outcome.reasons,
         extrapolated=outcome.extrapolated,
         threshold=outcome.threshold,
+        rig_correction=outcome.rig_correction,
         frames=len(frames),
         evidence=evidence,
         T_map_vehicle_guess=None if query.T_vehicle_camera is None else T_map_camera @ inverse(query.T_vehicle_camera),

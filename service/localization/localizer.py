@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from service.confidence.decision import decision_of, require_promise
+from service.confidence.decision import calibration_for, decision_of, require_promise
 from service.confidence.features import evidence_of, require_features
 from service.confidence.spread import Extent
 from service.geometry.rigid import Transform
@@ -135,7 +135,8 @@ class Localizer:
         # Of a tiled map, only the tiles of this query take part.
         bundle = self.bundle.around(lambda: start_positions_m(frames, predicted, self.bundle.manifest.lidar_height_m))
         cloud = bundle.cloud if query.refine else None
-        require_promise(bundle.calibration if query.refine else None, query)
+        calibration = calibration_for(bundle.calibration, (frame.query for frame in frames))
+        require_promise(calibration if query.refine else None, query)
         # 1. Retrieval: the most similar places, clusters of the views, and the paper's K-NN vote over the streets.
         with stage("search"):
             retrieved = retrieve(bundle, frames[0], self.clusters)
@@ -146,7 +147,7 @@ class Localizer:
             near, clusters, places_m = retrieved.neighbours, retrieved.hypotheses, bundle.T_map_place[:, :2, 3]
             evidence = None if refined is None else evidence_of(frames, refined, near, clusters, places_m, bundle.grid)
             # 4. Decision: status and calibrated confidence.
-            decision = None if cloud is None else decision_of(bundle.calibration, query, refined, evidence)
+            decision = None if cloud is None else decision_of(calibration, query, refined, evidence)
             return QueryResult(retrieved, refined, evidence, decision)
 
     def compose(self, frames: tuple[EncodedFrame, ...], found: QueryResult) -> Answer:

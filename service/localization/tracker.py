@@ -5,7 +5,7 @@ from functools import partial
 
 import numpy as np
 
-from service.confidence.decision import Decision
+from service.confidence.decision import Decision, calibration_for
 from service.geometry.rigid import Transform, inverse, nearest_rigid
 from service.localization.agreement import PREDICTED, agreed, frame_candidate_of, is_likely, updated_belief
 from service.localization.answer import Answer, require_finite
@@ -145,7 +145,7 @@ def _answer(localizer: Localizer, frames: tuple[EncodedFrame, ...], alone: Query
         found, used = localizer.register(frames), frames
         if _is_localized(found) and ceiling(found) > CONTRADICTED:
             return localizer.compose(frames, found)
-    calibration = localizer.bundle.calibration
+    calibration = calibration_for(localizer.bundle.calibration, (frame.query for frame in used))
     accepted = None if calibration is None else agreed(calibration, belief, frames[0].query.false_accept_rate)
     if calibration is not None and accepted is not None and alone.refined is not None:
         first, best = belief.modes[0], None if found.refined is None else found.refined.best

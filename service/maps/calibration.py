@@ -1,17 +1,27 @@
 """``calibration.json``: maps the confidence features of an answer to the probability that its position is right."""
 
 import json
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Sequence
 from itertools import pairwise
-from typing import ClassVar, Literal
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 from jaxtyping import Float64
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import (
+    BaseModel,
+    ConfigDict,
+    Field,
+    ValidationError,
+    model_serializer,
+    model_validator,
+)
 
 from service.errors import BundleError
+from service.maps.rig_key import RigKey
 
+#: Name of a correction for a rig in a map of an earlier release.
+UNNAMED = "unnamed"
 #: Largest distance of a right answer from the ground truth, metres on the ground. Confidence is the probability of a right answer.
 RIGHT_M = 1.0
 
@@ -123,10 +133,12 @@ class RigCorrection(_Frozen):
     """Correction of the confidence for a camera rig, learned from images of this rig in this map (decision 0150).
 
     The corrected log odds are ``scale * log_odds + offset``. With ``lower_only`` they are never larger than the log odds themselves. The
-    scale is positive, so the order of answers stays the same. The thresholds stay as they are. The calibration errors come from
-    cross-validation over blocks of consecutive frames.
+    scale is positive, so the order of answers stays the same. The calibration errors come from cross-validation over blocks of consecutive
+    frames.
 
     Attributes:
+        name: name of the correction. Answers state it.
+        made_for: the rig that the frames come from. None in a map of an earlier release, whose correction applies to every camera.
         scale: factor of the log odds.
         offset: added to the scaled log odds.
         lower_only: whether the correction may only lower the confidence, because the frames cannot show that it is too low.
@@ -142,8 +154,12 @@ class RigCorrection(_Frozen):
         wrong_share_upper: upper bound (95 %, Clopper-Pearson) of the share of wrong answers among accepted answers.
         outside_accepted: number of out-of-map frames that are accepted at the default threshold.
         outside_share_upper: upper bound (95 %, Clopper-Pearson) of the share of accepted out-of-map frames.
+        thresholds: thresholds from the out-of-map frames, sorted by rising false-accept rate. They hold for this rig instead of those of
+            the map. Empty: those of the map hold.
     """
 
+    name: str = Field(UNNAMED, min_length=1)
+    made_for: RigKey | None = None
     scale: float = Field(ge=0.2)
     offset: float
     lower_only: bool
@@ -159,6 +175,42 @@ class RigCorrection(_Frozen):
     wrong_share_upper: float = Field(ge=0, le=1)
     outside_accepted: int = Field(ge=0)
     outside_share_upper: float = Field(ge=0, le=1)
+    thresholds: tuple[Threshold, ...] = ()
+
+    @model_validator(mode="after")
+    def _consistent(self) -> "RigCorrection":
+        _require_rising(self.thresholds)
+        return self
+
+    @model_serializer(mode="wrap")
+    def _without_new_fields(self, serialize: Callable[[Any], dict[str, Any]]) -> dict[str, Any]:
+        """Leave out what a map of an earlier release does not have, so that its file keeps its bytes and its hash."""
+        content = serialize(self)
+        nothing = {"name": UNNAMED, "made_for": None, "thresholds": ()}
+        return {
+            name: value
+            for name, value in content.items()
+            if name not in nothing or getattr(self, name) != nothing[name]
+        }
+
+    def suits(self, asking: RigKey) -> tuple[bool, int, float] | None:
+        """Return how well the correction suits a rig; None if it was made for another one.
+
+        A correction from rendered images only lowers the confidence. So it also suits a rig that does not state its baseline or its range
+        limit. A correction from a recording may raise the confidence and set thresholds. So the rig must state the same as the recording.
+
+        Args:
+            asking: the rig of a query.
+
+        Returns:
+            Whether it comes from a recording, how many of baseline and range limit both rigs state, and the negative distance of the rigs.
+            The largest one suits best.
+        """
+        if self.made_for is None:
+            return None
+        is_rendered = self.source == "rendered"
+        away = self.made_for.distance(asking, other_may_lack=("baseline_m", "max_range_m") if is_rendered else ())
+        return None if away is None else (not is_rendered, self.made_for.stated_by_both(asking), -away)
 
     def corrected(self, log_odds: Float64[NDArray[np.float64], "*n"]) -> Float64[NDArray[np.float64], "*n"]:
         """Return the corrected log odds.
@@ -179,7 +231,8 @@ class Calibration(_Frozen):
         known: model of the event that the query was taken in the map, at any of its places.
         thresholds: sorted by rising false-accept rate.
         site: the map's own correction. None if it was not measured.
-        rig: correction for one camera rig, after that of the site. None if ``streetfix calibrate --map`` did not learn one.
+        rig: correction for every query, after that of the site. A map of an earlier release may have one, and ``for_rigs`` returns one.
+        rigs: corrections for queries of their rigs (``for_rigs``), the last one learned last. Each has its rig.
         measured_on: description of the calibration data for readers.
     """
 
@@ -190,6 +243,7 @@ class Calibration(_Frozen):
     thresholds: tuple[Threshold, ...] = Field(min_length=1)
     site: Site | None = None
     rig: RigCorrection | None = None
+    rigs: tuple[RigCorrection, ...] = ()
     measured_on: dict[str, str | float]
 
     @model_validator(mode="after")
@@ -198,13 +252,40 @@ class Calibration(_Frozen):
             unknown = [term.feature for term in model.terms if term.feature not in self.names]
             if unknown:
                 raise ValueError(f"{name}: {unknown[0]} is not one of the features")
-        rates = [threshold.false_accept_rate for threshold in self.thresholds]
-        if rates != sorted(rates):
-            raise ValueError("thresholds must be sorted by rising false-accept rate")
+        _require_rising(self.thresholds)
+        for number, each in enumerate(self.rigs):
+            if each.made_for is None:
+                raise ValueError(f"rigs.{number}: made_for is missing; it says which rig the correction is for")
         return self
 
+    @model_serializer(mode="wrap")
+    def _without_new_fields(self, serialize: Callable[[Any], dict[str, Any]]) -> dict[str, Any]:
+        """Leave out an empty ``rigs``, so that a map without a correction keeps the bytes and the hash of earlier releases."""
+        content = serialize(self)
+        return {name: value for name, value in content.items() if name != "rigs" or self.rigs}
+
+    def for_rigs(self, asking: Iterable[RigKey]) -> "Calibration":
+        """Return the calibration for a query: its ``rig`` is the correction that applies, and it has no other one.
+
+        The correction must suit the rigs of all images of the query. Of several, the one that suits the first image best applies, and of
+        equal ones the one that was learned last. Without one, ``rig`` stays: that of a map of an earlier release.
+
+        Args:
+            asking: rigs of the images of the query, the reference first.
+        """
+        if not self.rigs:
+            return self
+        keys, chosen = list(dict.fromkeys(asking)), self.rig
+        best: tuple[bool, int, float] | None = None
+        for each in self.rigs:
+            ranks = [each.suits(key) for key in keys]
+            first = ranks[0] if ranks and None not in ranks else None
+            if first is not None and (best is None or first >= best):
+                chosen, best = each, first
+        return self.model_copy(update={"rig": chosen, "rigs": ()})
+
     def confidence(self, evidence: Float64[NDArray[np.float64], "*n F"]) -> Float64[NDArray[np.float64], "*n"]:
-        """Return the probability that the position is within 1 m.
+        """Return the probability that the position is within 1 m, with the corrections of the site and of ``rig``.
 
         Args:
             evidence: confidence features in the order of ``features``.
@@ -244,15 +325,27 @@ class Calibration(_Frozen):
         """The lowest false-accept rate that calibration measured."""
         return self.thresholds[0].false_accept_rate
 
+    @property
+    def least_rate_of_rig(self) -> float | None:
+        """The lowest false-accept rate that the recording of ``rig`` supports; None if its correction has no thresholds."""
+        return None if self.rig is None or not self.rig.thresholds else self.rig.thresholds[0].false_accept_rate
+
     def threshold_at(self, false_accept_rate: float) -> Threshold:
         """Return the threshold for a given false-accept rate: that of the highest measured rate that does not exceed it.
 
+        The thresholds of ``rig`` replace those of the map. At a rate that they do not support, the stricter of both applies.
+
         Args:
-            false_accept_rate: tolerated share of accepted out-of-map queries. Below ``least_false_accept_rate`` the threshold
-                of that rate applies.
+            false_accept_rate: tolerated share of accepted out-of-map queries. Below the lowest measured rate the threshold of that rate
+                applies.
         """
-        fitting = [each for each in self.thresholds if each.false_accept_rate <= false_accept_rate]
-        return fitting[-1] if fitting else self.thresholds[0]
+        of_map = _threshold_among(self.thresholds, false_accept_rate)
+        if self.rig is None or not self.rig.thresholds:
+            return of_map
+        of_rig = _threshold_among(self.rig.thresholds, false_accept_rate)
+        if of_rig.false_accept_rate <= false_accept_rate:
+            return of_rig
+        return max(of_rig, of_map, key=lambda each: each.confidence)
 
     def threshold(self, false_accept_rate: float) -> float:
         """Return the least confidence of an accepted answer for a given false-accept rate, as in ``threshold_at``.
@@ -261,6 +354,18 @@ class Calibration(_Frozen):
             false_accept_rate: tolerated share of accepted out-of-map queries.
         """
         return self.threshold_at(false_accept_rate).confidence
+
+
+def _require_rising(thresholds: Sequence[Threshold]) -> None:
+    rates = [threshold.false_accept_rate for threshold in thresholds]
+    if rates != sorted(rates):
+        raise ValueError("thresholds must be sorted by rising false-accept rate")
+
+
+def _threshold_among(thresholds: Sequence[Threshold], false_accept_rate: float) -> Threshold:
+    """Return the threshold of the highest rate that does not exceed a rate, else that of the lowest rate."""
+    fitting = [each for each in thresholds if each.false_accept_rate <= false_accept_rate]
+    return fitting[-1] if fitting else thresholds[0]
 
 
 def corrected_log_odds(

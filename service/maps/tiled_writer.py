@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from service.errors import BundleError
 from service.maps import content as parts
 from service.maps import index, inverted_file, manifest, streets
-from service.maps.calibration import Calibration, RigCorrection, Site, read_calibration
+from service.maps.calibration import Calibration, Site, read_calibration
 from service.maps.files import json_object, read_file, require_files
 from service.maps.inverted_file import InvertedFile
 from service.maps.joined_index import JoinedRows
@@ -33,7 +33,7 @@ def write_tiled(
     *,
     name: str,
     overwrite: bool = False,
-    rig: RigCorrection | None = None,
+    corrected: Calibration | None = None,
 ) -> Manifest:
     """Write a tiled map and return its manifest.
 
@@ -46,7 +46,7 @@ def write_tiled(
         tile_m: edge of the squares, m.
         name: name of the map in requests.
         overwrite: replace an existing map.
-        rig: correction of the confidence for a rig, which belongs to the whole map; None for none.
+        corrected: calibration whose corrections for rigs the map gets, because they belong to the whole map; None for none.
 
     Raises:
         BundleError: ``out`` exists and ``overwrite`` is False, there is no tile, a tile is damaged or does not fit to the others, or the
@@ -68,7 +68,7 @@ def write_tiled(
             _link_tile(partial, folder, each, square, links)
             for square, folder, each in zip(squares, folders, manifests, strict=True)
         ]
-        made = _write_shared(partial, entries, manifests, tile_m, name, rig, links)
+        made = _write_shared(partial, entries, manifests, tile_m, name, corrected, links)
         partial.chmod(0o755)
     return made
 
@@ -152,7 +152,7 @@ def _write_shared(
     manifests: Sequence[Manifest],
     tile_m: float,
     name: str,
-    rig: RigCorrection | None,
+    corrected: Calibration | None,
     links: _Links,
 ) -> Manifest:
     """Write the shared files and the manifest; return the manifest."""
@@ -173,7 +173,7 @@ def _write_shared(
     opened, numbers = (MapBundle.open(bundle, verify=False) for bundle in bundles), street_numbers(named)
     places = [places_in_map(each, numbers, lidar_height_m) for each in opened]
     np.save(folder / parts.PLACES_FILE, np.concatenate(places), allow_pickle=False)
-    (folder / parts.CALIBRATION_FILE).write_bytes(json_bytes(_calibration(bundles, rig)))
+    (folder / parts.CALIBRATION_FILE).write_bytes(json_bytes(_calibration(bundles, corrected)))
     parameters = {key: value for key, value in first.parameters.items() if key in _common(manifests)}
     parameters["lidar_height_m"] = lidar_height_m
     for key in LARGEST:
@@ -260,11 +260,11 @@ def joined_streets(paths: Sequence[Path]) -> dict[str, Any] | None:
     return {**documents[0], "features": list(joined.values())}
 
 
-def _calibration(bundles: Sequence[Path], rig: RigCorrection | None) -> dict[str, Any]:
-    """Return the calibration of the map: that of the tiles, with the checks of all their sites together and the correction of the map."""
+def _calibration(bundles: Sequence[Path], corrected: Calibration | None) -> dict[str, Any]:
+    """Return the calibration of the map: that of the tiles, with the checks of all their sites together and the corrections of the map."""
     read = [_read(bundle) for bundle in bundles]
     first = read[0]
-    plain = [None if each is None else each.model_copy(update={"site": None, "rig": None}) for each in read]
+    plain = [None if each is None else each.model_copy(update={"site": None, "rig": None, "rigs": ()}) for each in read]
     for bundle, each in zip(bundles, plain, strict=True):
         if each != plain[0]:
             raise BundleError(
@@ -273,7 +273,8 @@ def _calibration(bundles: Sequence[Path], rig: RigCorrection | None) -> dict[str
     if first is None:
         return dict(parts.UNCALIBRATED)
     sites = [each.site for each in read if each is not None and each.site is not None]
-    return first.model_copy(update={"site": joined_site(sites), "rig": rig}).model_dump(mode="json")
+    own = {"rig": None, "rigs": ()} if corrected is None else {"rig": corrected.rig, "rigs": corrected.rigs}
+    return first.model_copy(update={"site": joined_site(sites), **own}).model_dump(mode="json")
 
 
 def _read(bundle: Path) -> Calibration | None:

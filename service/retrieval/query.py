@@ -23,6 +23,7 @@ from service.imaging.picture_headers import DEFAULT_LIMITS
 from service.imaging.rectify import rectification_of, rectified_pair
 from service.imaging.resample import finest_rad
 from service.imaging.view_grid import ViewGrid
+from service.maps.rig_key import RigKey
 from service.option_limits import FALSE_ACCEPT_RATE, NEIGHBOURS
 from service.retrieval.prior import Prior
 
@@ -44,7 +45,10 @@ class Query:
         prior: prior of the camera pose; None if nothing is known.
         baseline_m: baseline of the stereo rig that measured the depth; None if no rig is known. With a baseline, registration also
             estimates the disparity offset, and the depth noise is at least that of stereo matching.
+        max_range_m: range limit of the depth, metres; None: none is stated. The depth image has no larger depths.
         false_accept_rate: largest tolerated share of out-of-map queries that become LOCALIZED, 0 to 1.
+        rate_is_named: whether the request names this rate; False: it is the default of the service. A named rate is refused if the
+            recording of the query's rig does not support it.
         observed: pixels of the depth image that the lens saw; None: all. A rectified image has others.
     """
 
@@ -59,7 +63,9 @@ class Query:
     ranked: int = 0
     prior: Prior | None = None
     baseline_m: float | None = None
+    max_range_m: float | None = None
     false_accept_rate: float = FALSE_ACCEPT_RATE
+    rate_is_named: bool = False
     observed: Bool[NDArray[np.bool_], "h w"] | None = None
 
     def __post_init__(self) -> None:
@@ -83,6 +89,7 @@ class Query:
         camera: PinholeCamera,
         *,
         baseline_m: float | None = None,
+        max_range_m: float | None = None,
     ) -> "Query":
         """Rectify an image pair, and build the query that has the default options.
 
@@ -91,6 +98,7 @@ class Query:
             depth_m: z of each pixel of the sent image, metres, 0 where nothing was measured. It has the aspect ratio of the camera.
             camera: intrinsics and distortion of both images.
             baseline_m: baseline of the stereo rig that measured the depth, metres; None if no rig is known.
+            max_range_m: range limit of the depth, metres; None if none is stated. The depth image must not exceed it.
 
         Raises:
             RequestError: the distortion is not invertible over the image, or the rectified image would be empty.
@@ -98,8 +106,18 @@ class Query:
         """
         pair = rectified_pair(rgb, depth_m, camera)
         return cls(
-            rgb=pair.rgb, depth_m=pair.depth_m, camera=pair.camera, observed=pair.observed, baseline_m=baseline_m
+            rgb=pair.rgb,
+            depth_m=pair.depth_m,
+            camera=pair.camera,
+            observed=pair.observed,
+            baseline_m=baseline_m,
+            max_range_m=max_range_m,
         )
+
+    @property
+    def rig(self) -> RigKey:
+        """The rig of the query: the rectified camera and what the query states about the depth sensor."""
+        return RigKey.of(self.camera, baseline_m=self.baseline_m, max_range_m=self.max_range_m)
 
     @property
     def focal_baseline_px_m(self) -> float | None:
@@ -165,4 +183,6 @@ def decoded_query(
         limits=limits,
     )
     require_sizes(colour, depth_m, camera, rgb_size=stored_size(rgb))
-    return Query.of_images(colour, depth_m, camera, baseline_m=depth_format.baseline_m)
+    return Query.of_images(
+        colour, depth_m, camera, baseline_m=depth_format.baseline_m, max_range_m=depth_format.max_range_m
+    )

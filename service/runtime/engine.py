@@ -457,6 +457,7 @@ def query_in(
         refine=encoded.refine,
         prior=prior_in(encoded, bundle),
         false_accept_rate=encoded.false_accept_rate or false_accept_rate,
+        rate_is_named=encoded.false_accept_rate is not None,
     )
 
 

@@ -487,6 +487,14 @@ def test_the_threshold_is_printed_beside_the_confidence(rest: Any) -> None:
 
 
 @pytest.mark.parametrize("rest", [{}, REFUSED])
+@pytest.mark.parametrize("name", [None, "mule"])
+def test_the_correction_for_the_rig_is_printed(rest: Any, name: str | None) -> None:
+    out = io.StringIO()
+    print_answer(ANSWER | rest | {"rig_correction": name}, Console(file=out, width=200))
+    assert ("confidence corrected for mule" in out.getvalue()) is (name is not None)
+
+
+@pytest.mark.parametrize("rest", [{}, REFUSED])
 @pytest.mark.parametrize(("outside", "shown"), [({}, False), ({"front": 5.2}, True)])
 def test_an_extrapolated_confidence_is_printed_with_its_features(rest: Any, outside: Any, shown: bool) -> None:
     out = io.StringIO()

@@ -172,6 +172,7 @@ def test_a_lens_of_another_enum_value_is_refused() -> None:
         {"calibration": "in_range"},
         {"calibration": "extrapolated", "extrapolated": {"front": 5.25, "points": -4.5}},
         {"threshold": {"confidence": 0.9, "false_accept_rate": 0.01}},
+        {"rig_correction": "mule"},
         {"status": "AMBIGUOUS", "camera_height": {"height_m": 1.5, "origin": "assumed"}},
         {"hypotheses": [{"confirmed": True, "pose": POSE, "share": 1, "inliers": 0.5, "similarity": 0.25}]},
         {

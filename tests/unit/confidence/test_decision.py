@@ -1,10 +1,15 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from service.confidence.decision import decide
+from service.confidence.decision import calibration_for, decide, require_promise
 from service.confidence.features import FEATURES
+from service.errors import RequestError
+from service.geometry.camera import PinholeCamera
+from service.retrieval.query import Query
 
 
 def odds(p):
@@ -122,3 +127,78 @@ def test_a_prior_turns_an_uncertain_answer_into_an_accepted_one_and_out_of_map_i
 def test_a_prior_that_agrees_never_lowers_a_confidence_nor_makes_it_more_than_one(decided, right, known, nats):
     without = decided(right, known).confidence
     assert without - 1e-9 <= decided(right, known, prior_nats=nats).confidence <= 1
+
+
+RIG = {
+    "name": "mule",
+    "made_for": {"width": 6, "height": 4, "fx": 3.0, "fy": 3.0, "cx": 2.5, "cy": 1.5},
+    "scale": 1.0,
+    "offset": -1.0,
+    "lower_only": False,
+    "source": "drive",
+    "measured_on": "a drive",
+    **dict.fromkeys(("frames", "right", "outside", "accepted", "accepted_wrong", "outside_accepted"), 60),
+    **dict.fromkeys(("error_before", "error_after", "wrong_share_upper", "outside_share_upper"), 0.1),
+    "thresholds": [{"false_accept_rate": 0.05, "confidence": 0.7}],
+}
+
+
+@pytest.fixture
+def query():
+    """The camera of the rig, with half of the field of view of a rig without a correction."""
+    camera = PinholeCamera(6, 4, 3.0, 3.0, 2.5, 1.5)
+    return Query(rgb=np.zeros((4, 6, 3), np.uint8), depth_m=np.zeros((4, 6), np.float32), camera=camera)
+
+
+def test_the_calibration_for_a_query_has_the_correction_of_its_rig(calibration_of, query):
+    calibration = calibration_of(rigs=[RIG])
+    found = calibration_for(calibration, (query, query))
+    assert found is not None
+    assert found.rig == calibration.rigs[0]
+    wide = replace(query, camera=replace(query.camera, fx=1.5, fy=1.5))
+    for queries in ((wide,), (query, wide), (replace(query, baseline_m=0.1),), (replace(query, max_range_m=9.0),)):
+        found = calibration_for(calibration, queries)
+        assert found is not None
+        assert found.rig is None
+    assert calibration_for(None, (query,)) is None
+    plain = calibration_of()
+    assert calibration_for(plain, (query,)) is plain
+
+
+@pytest.mark.parametrize(
+    ("rate", "named", "least"),
+    [
+        (0.04, True, "0.05"),  # the recording supports 0.05 or more
+        (0.05, True, None),
+        (0.04, False, None),  # the default of the service is answered
+        (0.0005, False, "0.001"),  # not below what the map supports
+    ],
+)
+def test_a_named_rate_must_be_supported_by_the_recording_of_the_rig(calibration_of, query, rate, named, least):
+    asking = replace(query, false_accept_rate=rate, rate_is_named=named)
+    calibration = calibration_for(calibration_of(rigs=[RIG]), (asking,))
+    if least is None:
+        require_promise(calibration, asking)
+        return
+    with pytest.raises(RequestError, match=f"send {least} or more") as caught:
+        require_promise(calibration, asking)
+    assert caught.value.field == "options.false_accept_rate"
+
+
+def test_without_thresholds_of_its_own_a_rig_has_those_of_the_map(calibration_of, query):
+    asking = replace(query, false_accept_rate=0.001, rate_is_named=True)
+    calibration = calibration_for(calibration_of(rigs=[RIG | {"thresholds": []}]), (asking,))
+    assert calibration is not None
+    require_promise(calibration, asking)
+    assert calibration.threshold(0.001) == 0.9
+
+
+def test_a_status_follows_from_the_threshold_of_the_rig(calibration_of, query):
+    """Log odds of 2 become 1, a confidence of 0.731. At a rate of 5 % the map accepts 0.4, and the recording 0.7."""
+    in_range = {"right": {"terms": [], "bias": 2.0}}
+    for threshold, status in ((0.7, "LOCALIZED"), (0.75, "AMBIGUOUS")):
+        rig = RIG | {"thresholds": [{"false_accept_rate": 0.05, "confidence": threshold}]}
+        calibration = calibration_for(calibration_of(rigs=[rig], **in_range), (query,))
+        assert calibration is not None
+        found = decide(calibration, np.zeros(len(FEATURES)), 0.05)
+        assert (found.status, found.confidence) == (status, pytest.approx(0.7310586))

@@ -372,5 +372,11 @@ def test_an_answer_states_the_threshold_that_decided(localized):
     assert found == schema.AcceptanceThreshold(confidence=0.9, false_accept_rate=0.01)
 
 
+def test_an_answer_states_the_correction_for_its_rig(localized):
+    assert answer_from(localized).rig_correction is None
+    answer = replace(localized.answer, rig_correction="mule")
+    assert answer_from(replace(localized, answer=answer)).rig_correction == "mule"
+
+
 def spread_of(localized):
     return Spread(localized.answer.T_map_camera_guess[:3, 3], np.eye(3), 0.1, 0.5)

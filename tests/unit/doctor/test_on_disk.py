@@ -58,6 +58,26 @@ def test_a_calibration_must_promise_the_rate_of_the_service(content_of, calibrat
     assert told.remedy == ("" if level == "ok" else "set STREETFIX_FALSE_ACCEPT_RATE to 0.001 or more")
 
 
+def test_the_corrections_for_rigs_are_named(content_of, calibration_json, tmp_path):
+    """A map may have one of an earlier release, which is for every rig."""
+    numbers = ("frames", "right", "outside", "accepted", "accepted_wrong", "outside_accepted", "offset")
+    shares = ("error_before", "error_after", "wrong_share_upper", "outside_share_upper")
+    old = {
+        "scale": 1,
+        "lower_only": True,
+        "source": "drive",
+        "measured_on": "old",
+        **dict.fromkeys((*numbers, *shares), 0),
+    }
+    camera = {"width": 64, "height": 48, "fx": 32, "fy": 32, "cx": 31.5, "cy": 23.5}
+    rigs = [old | {"name": name, "made_for": camera, "measured_on": f"of {name}"} for name in ("mule", "wagon")]
+    write_bundle(tmp_path / "own", content_of(calibration=calibration_json(rig=old, rigs=rigs)))
+    told = on_disk.check_calibration(MapBundle.open(tmp_path / "own"), 0.01)
+    assert told.text == (
+        "the map is calibrated, not corrected for this site, and for every rig (old), and for mule (of mule), and for wagon (of wagon)"
+    )
+
+
 def test_a_map_without_cloud_and_streets_gives_warnings(content_of, tmp_path):
     write_bundle(tmp_path / "own", content_of(cloud=None, streets=None, place_street=content_of().place_street * 0 - 1))
     bundle = MapBundle.open(tmp_path / "own")

@@ -92,6 +92,12 @@ def test_a_confidence_that_is_extrapolated_is_a_warning(pair, localizer, monkeyp
     assert "calibrate" in told.remedy
 
 
+def test_the_correction_for_the_rig_is_named(pair, localizer, monkeypatch):
+    answer = replace(answer_of(pair, localizer, 0.02), confidence=0.95, rig_correction="mule")
+    monkeypatch.setattr(on_map, "answer_of", lambda *_: answer)
+    assert check_answer(pair, localizer, 0.02).text == "LOCALIZED (confidence 0.950, with the correction for mule)"
+
+
 def test_a_query_that_the_service_refuses_is_a_problem(pair, localizer):
     wgs84 = replace(pair, encoded=replace(pair.encoded, prior_wgs84=(52.5, 13.4), prior=_prior()))
     told = check_answer(wgs84, localizer, 0.02)

@@ -54,6 +54,7 @@ def test_the_answer_has_the_contracts_form(client: httpx.Client, parts_of: Parts
         "calibration",
         "extrapolated",
         "threshold",
+        "rig_correction",
         "belief",
         "map",
         "timings_ms",

@@ -93,13 +93,16 @@ def test_one_picture_counts_once(ask, frames):
 
 def test_only_the_reference_has_options(frames, monkeypatch):
     in_range(monkeypatch)
-    reference = replace(frames[0].query, false_accept_rate=0.05, prior=Prior(position_m=np.zeros(2)))
+    reference = replace(
+        frames[0].query, false_accept_rate=0.05, rate_is_named=True, prior=Prior(position_m=np.zeros(2))
+    )
     other = replace(frames[1].query, refine=False, false_accept_rate=0.01)
     asked = []
 
     def register(some, _predicted):
         if len(some) > 1:
             return found(0.6, (0.0, 0.9))
+        assert not some[0].query.rate_is_named  # the frames together were refused, if a rate is not supported
         asked.append((some[0].query.refine, some[0].query.false_accept_rate, some[0].query.prior))
         np.testing.assert_array_equal(some[0].T_reference_camera, np.eye(4))
         return found(0.7, (0.0, 0.99))

@@ -263,6 +263,16 @@ def test_a_correction_for_a_rig_stays_only_if_both_maps_have_the_same():
     assert joined_calibration(none, {"calibrated": True, "site": None})["rig"] is None
 
 
+def test_of_several_corrections_those_stay_that_both_maps_have():
+    none, a, b = {"calibrated": True, "site": None}, {"name": "a", "scale": 0.5}, {"name": "b", "scale": 0.6}
+    changed = a | {"scale": 0.7}
+    assert joined_calibration(none | {"rigs": [a, b]}, none | {"rigs": [b, a]})["rigs"] == [a, b]
+    assert joined_calibration(none | {"rigs": [a, b]}, none | {"rigs": [changed, b]})["rigs"] == [b]
+    for other in (none, none | {"rigs": [changed]}):
+        assert "rigs" not in joined_calibration(none | {"rigs": [a]}, other)
+        assert "rigs" not in joined_calibration(other, none | {"rigs": [a]})
+
+
 def test_with_an_uncalibrated_map_the_whole_is_uncalibrated():
     none = {"calibrated": False, "why": "because"}
     assert joined_calibration({"calibrated": True, "site": None}, none) == none

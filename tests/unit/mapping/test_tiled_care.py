@@ -78,6 +78,8 @@ def test_a_correction_for_a_rig_stays_if_both_maps_have_it(
         **dict.fromkeys(("frames", "right", "outside", "accepted", "accepted_wrong", "outside_accepted"), 9),
         **dict.fromkeys(("error_before", "error_after", "wrong_share_upper", "outside_share_upper"), 0.1),
     }
+    camera = {"width": 640, "height": 480, "fx": 320.0, "fy": 320.0, "cx": 319.5, "cy": 239.5}
+    common = rig | {"name": "common", "made_for": camera}
     numbers, bundle = sorted(squares), MapBundle.open(squares[sorted(squares)[0]])
     for k, name in enumerate(("one", "other", "none")):
         bundle = MapBundle.open(squares[numbers[min(k, 1)]])
@@ -85,12 +87,14 @@ def test_a_correction_for_a_rig_stays_if_both_maps_have_it(
         write_bundle(tmp_path / f"tile-{name}", content)
         write_tiled(tmp_path / name, {numbers[k]: tmp_path / f"tile-{name}"}, TILE_M, name=name)
         if name != "none":
-            replace_calibration(tmp_path / name, calibration_json(rig=rig))
-    for second, expected in (("other", RigCorrection.model_validate(rig)), ("none", None)):
+            own = rig | {"name": name, "made_for": camera | {"baseline_m": 0.1 if name == "one" else 0.2}}
+            replace_calibration(tmp_path / name, calibration_json(rig=rig, rigs=[common, own]))
+    old, both = RigCorrection.model_validate(rig), (RigCorrection.model_validate(common),)
+    for second, expected, rigs in (("other", old, both), ("none", None, ())):
         merge_tiled(tmp_path / "one", tmp_path / second, tmp_path / f"with-{second}")
         calibration = TiledMap.open(tmp_path / f"with-{second}").calibration
         assert calibration is not None
-        assert calibration.rig == expected
+        assert (calibration.rig, calibration.rigs) == (expected, rigs)
 
 
 def test_a_square_of_both_maps_is_merged(

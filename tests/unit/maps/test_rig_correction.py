@@ -19,6 +19,7 @@ from service.errors import BundleError
 from service.maps import writer
 from service.maps.calibration import RigCorrection, probability, read_calibration
 from service.maps.reader import MapBundle
+from service.maps.rig_key import RigKey
 from service.maps.writer import replace_calibration, write_bundle
 
 RIG = {
@@ -100,6 +101,139 @@ def test_an_answer_raised_above_the_odds_of_being_in_the_map_gains_from_a_prior(
     # Without a correction for a rig the decision is as before.
     plain = calibration_of(right=flat | {"bias": 0.0}, known=flat | {"bias": -2.0})
     assert decide(plain, evidence, 0.01, prior_nats=1.0).confidence == pytest.approx(float(probability(np.array(-1.0))))
+
+
+KEY = {"width": 640, "height": 480, "fx": 320.0, "fy": 320.0, "cx": 319.5, "cy": 239.5}
+WIDE = KEY | {"fx": 200.0, "fy": 200.0}
+
+
+def key(**changed):
+    return RigKey.model_validate(KEY | changed)
+
+
+def made_for(name, camera, **changed):
+    """Return a correction as it is stored. Its offset tells it from others."""
+    return RIG | {"name": name, "made_for": camera} | changed
+
+
+def chosen(calibration, *asking):
+    found = calibration.for_rigs(asking)
+    assert found.rigs == ()
+    return None if found.rig is None else found.rig.name
+
+
+def test_each_rig_gets_its_own_correction_and_a_third_rig_none(calibration_of):
+    """Log odds of 4 become 0.5 x 4 - 1 = 1 for the first rig and 0.5 x 4 - 2 = 0 for the second."""
+    rigs = [made_for("narrow", KEY), made_for("wide", WIDE, offset=-2.0)]
+    calibration = calibration_of(right={"terms": [], "bias": 4.0}, rigs=rigs)
+    odds = {"narrow": 1.0, "wide": 0.0, None: 4.0}
+    for camera, name in ((KEY, "narrow"), (WIDE, "wide"), (KEY | {"fx": 260.0}, None)):
+        found = calibration.for_rigs([RigKey.model_validate(camera)])
+        assert chosen(calibration, RigKey.model_validate(camera)) == name
+        confidence = float(found.confidence(np.zeros(len(FEATURES))))
+        assert confidence == pytest.approx(float(probability(np.array(odds[name]))))
+
+
+def test_a_calibration_without_rigs_is_the_same_object_for_every_query(calibration_of):
+    for calibration in (calibration_of(), calibration_of(rig=RIG)):
+        assert calibration.for_rigs([key()]) is calibration
+
+
+def test_the_correction_of_an_earlier_release_applies_where_no_rig_has_one(calibration_of):
+    calibration = calibration_of(rig=RIG, rigs=[made_for("wide", WIDE)])
+    assert chosen(calibration, key()) == "unnamed"
+    assert chosen(calibration, RigKey.model_validate(WIDE)) == "wide"
+
+
+def test_all_images_of_a_query_must_be_of_the_rig(calibration_of):
+    calibration = calibration_of(rigs=[made_for("narrow", KEY), made_for("wide", WIDE)])
+    assert chosen(calibration, key(), key()) == "narrow"
+    assert chosen(calibration, key(), RigKey.model_validate(WIDE)) is None
+
+
+def test_what_a_query_does_not_state_counts_only_against_a_correction_from_a_recording(calibration_of):
+    stereo = KEY | {"baseline_m": 0.12, "max_range_m": 20.0}
+    drive, rendered = made_for("drive", stereo), made_for("rendered", stereo, source="rendered", lower_only=True)
+    assert chosen(calibration_of(rigs=[drive]), key()) is None
+    assert chosen(calibration_of(rigs=[rendered]), key()) == "rendered"
+    for each in (drive, rendered):
+        full = key(baseline_m=0.12, max_range_m=20.0)
+        assert chosen(calibration_of(rigs=[each]), full) == each["name"]
+        assert chosen(calibration_of(rigs=[each]), key(baseline_m=0.3, max_range_m=20.0)) is None
+    # Without a baseline the correction is for another depth sensor.
+    assert chosen(calibration_of(rigs=[made_for("tof", KEY, source="rendered")]), key(baseline_m=0.12)) is None
+
+
+@pytest.mark.parametrize("turned", [False, True])
+def test_of_several_corrections_the_one_that_suits_best_applies(calibration_of, turned):
+    """First a recording, then the most that both state, then the nearest, then the last one."""
+    short, long = (
+        made_for(name, KEY | {"max_range_m": limit}, source="rendered")
+        for name, limit in (("short", 5.0), ("long", 20.0))
+    )
+    near = made_for("near", KEY | {"fx": 318.0, "max_range_m": 5.0}, source="rendered")
+    drive = made_for("drive", KEY | {"fx": 310.0})
+
+    def of(*rigs):
+        return calibration_of(rigs=rigs[::-1] if turned else rigs)
+
+    assert chosen(of(short, long), key(max_range_m=20.0)) == "long"
+    assert chosen(of(short, near), key()) == "short"
+    assert chosen(of(near, drive), key()) == "drive"
+    assert chosen(of(short, long), key()) == ("short" if turned else "long")
+
+
+def test_a_correction_in_the_list_must_say_its_rig(calibration_json):
+    with pytest.raises(BundleError, match=r"rigs\.0: made_for is missing"):
+        read_calibration(json.dumps(calibration_json(rigs=[RIG])).encode(), path="x")
+
+
+def test_files_of_earlier_releases_keep_their_bytes(calibration_json):
+    """A map without a correction for a rig, and one with the correction of an earlier release, are written as they were."""
+    for document in (calibration_json(), calibration_json(rig=RIG)):
+        found = read_calibration(json.dumps(document).encode(), path="x")
+        assert found is not None
+        assert json.loads(found.model_dump_json()) == document
+        assert found.model_dump(mode="json") == document
+
+
+def test_a_list_of_corrections_is_read_as_it_was_written(calibration_json):
+    thresholds = [{"false_accept_rate": 0.05, "confidence": 0.8}]
+    document = calibration_json(
+        rigs=[made_for("a", KEY | {"baseline_m": None, "max_range_m": 5.0}, thresholds=thresholds)]
+    )
+    found = read_calibration(json.dumps(document).encode(), path="x")
+    assert found is not None
+    assert json.loads(found.model_dump_json()) == document
+    assert found.rigs[0].made_for == key(max_range_m=5.0)
+
+
+OF_RIG = [{"false_accept_rate": 0.05, "confidence": 0.8}, {"false_accept_rate": 0.1, "confidence": 0.3}]
+
+
+@pytest.mark.parametrize(
+    ("rate", "of_map", "expected"),
+    [
+        (0.05, 0.4, (0.05, 0.8)),  # the recording supports the rate
+        (0.07, 0.4, (0.05, 0.8)),
+        (0.1, 0.4, (0.1, 0.3)),
+        (0.01, 0.4, (0.05, 0.8)),  # it does not: the stricter of both, with its rate
+        (0.01, 0.9, (0.01, 0.9)),
+    ],
+)
+def test_the_thresholds_of_a_recording_replace_those_of_the_map(calibration_of, rate, of_map, expected):
+    thresholds = [{"false_accept_rate": 0.01, "confidence": of_map}]
+    calibration = calibration_of(thresholds=thresholds, rigs=[made_for("a", KEY, thresholds=OF_RIG)])
+    found = calibration.for_rigs([key()]).threshold_at(rate)
+    assert (found.false_accept_rate, found.confidence) == expected
+    other = calibration.for_rigs([RigKey.model_validate(WIDE)])
+    assert other.threshold(rate) == of_map
+    assert (calibration.for_rigs([key()]).least_rate_of_rig, other.least_rate_of_rig) == (0.05, None)
+
+
+def test_thresholds_of_a_rig_that_do_not_rise_are_refused():
+    with pytest.raises(ValidationError, match="thresholds must be sorted"):
+        rig(thresholds=OF_RIG[::-1])
 
 
 def rig_in(bundle):

@@ -43,6 +43,19 @@ def test_a_query_without_distortion_has_its_images_as_they_are():
     assert (query.camera, query.observed, query.baseline_m) == (camera, None, None)
 
 
+def test_the_rig_of_a_query_has_the_rectified_camera_and_what_the_request_states_of_the_depth():
+    lens = PinholeCamera(64, 48, 32.0, 32.0, 31.5, 23.5, (0.0,) * 4, "kannala_brandt")
+    rgb = cv2.imencode(".jpg", np.full((48, 64, 3), 90, np.uint8))[1].tobytes()
+    depth = write_raw16(np.full((48, 64), 5000, np.uint16))
+    stated = DepthFormat(baseline_m=0.1, max_range_m=20.0)
+    rig = decoded_query(rgb, depth, lens, stated, grid=ViewGrid()).rig
+    pinhole = rectification_of(lens).camera
+    assert (rig.width, rig.height, rig.fx, rig.cx) == (pinhole.width, pinhole.height, pinhole.fx, pinhole.cx)
+    assert (rig.baseline_m, rig.max_range_m) == (0.1, 20.0)
+    silent = decoded_query(rgb, depth, lens, DepthFormat(), grid=ViewGrid()).rig
+    assert (silent.baseline_m, silent.max_range_m) == (None, None)
+
+
 def test_a_reduced_jpeg_of_a_lens_is_rectified_at_its_own_size():
     grid, camera = ViewGrid(), PinholeCamera(1280, 960, 700.0, 700.0, 639.5, 479.5, (-0.2, 0.05, 0.0, 0.0))
     rgb = cv2.imencode(".jpg", np.full((960, 1280, 3), 90, np.uint8))[1].tobytes()

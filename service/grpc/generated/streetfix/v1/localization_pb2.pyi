@@ -362,7 +362,7 @@ class Options(_message.Message):
     def __init__(self, neighbours: _Optional[int] = ..., refine: _Optional[bool] = ..., false_accept_rate: _Optional[float] = ...) -> None: ...
 
 class LocalizeResponse(_message.Message):
-    __slots__ = ("status", "confidence", "street", "pose", "vehicle_pose", "geopose", "neighbours", "map", "timings", "hypotheses", "spread", "reasons", "camera_height", "calibration", "extrapolated", "threshold", "belief")
+    __slots__ = ("status", "confidence", "street", "pose", "vehicle_pose", "geopose", "neighbours", "map", "timings", "hypotheses", "spread", "reasons", "camera_height", "calibration", "extrapolated", "threshold", "belief", "rig_correction")
     class ExtrapolatedEntry(_message.Message):
         __slots__ = ("key", "value")
         KEY_FIELD_NUMBER: _ClassVar[int]
@@ -387,6 +387,7 @@ class LocalizeResponse(_message.Message):
     EXTRAPOLATED_FIELD_NUMBER: _ClassVar[int]
     THRESHOLD_FIELD_NUMBER: _ClassVar[int]
     BELIEF_FIELD_NUMBER: _ClassVar[int]
+    RIG_CORRECTION_FIELD_NUMBER: _ClassVar[int]
     status: LocalizationStatus
     confidence: float
     street: Street
@@ -404,7 +405,8 @@ class LocalizeResponse(_message.Message):
     extrapolated: _containers.ScalarMap[str, float]
     threshold: AcceptanceThreshold
     belief: Belief
-    def __init__(self, status: _Optional[_Union[LocalizationStatus, str]] = ..., confidence: _Optional[float] = ..., street: _Optional[_Union[Street, _Mapping]] = ..., pose: _Optional[_Union[Pose, _Mapping]] = ..., vehicle_pose: _Optional[_Union[Pose, _Mapping]] = ..., geopose: _Optional[_Union[GeoPose, _Mapping]] = ..., neighbours: _Optional[_Iterable[_Union[Neighbour, _Mapping]]] = ..., map: _Optional[_Union[MapVersion, _Mapping]] = ..., timings: _Optional[_Union[Timings, _Mapping]] = ..., hypotheses: _Optional[_Iterable[_Union[Hypothesis, _Mapping]]] = ..., spread: _Optional[_Union[Spread, _Mapping]] = ..., reasons: _Optional[_Iterable[_Union[Reason, _Mapping]]] = ..., camera_height: _Optional[_Union[CameraHeight, _Mapping]] = ..., calibration: _Optional[_Union[CalibrationRange, str]] = ..., extrapolated: _Optional[_Mapping[str, float]] = ..., threshold: _Optional[_Union[AcceptanceThreshold, _Mapping]] = ..., belief: _Optional[_Union[Belief, _Mapping]] = ...) -> None: ...
+    rig_correction: str
+    def __init__(self, status: _Optional[_Union[LocalizationStatus, str]] = ..., confidence: _Optional[float] = ..., street: _Optional[_Union[Street, _Mapping]] = ..., pose: _Optional[_Union[Pose, _Mapping]] = ..., vehicle_pose: _Optional[_Union[Pose, _Mapping]] = ..., geopose: _Optional[_Union[GeoPose, _Mapping]] = ..., neighbours: _Optional[_Iterable[_Union[Neighbour, _Mapping]]] = ..., map: _Optional[_Union[MapVersion, _Mapping]] = ..., timings: _Optional[_Union[Timings, _Mapping]] = ..., hypotheses: _Optional[_Iterable[_Union[Hypothesis, _Mapping]]] = ..., spread: _Optional[_Union[Spread, _Mapping]] = ..., reasons: _Optional[_Iterable[_Union[Reason, _Mapping]]] = ..., camera_height: _Optional[_Union[CameraHeight, _Mapping]] = ..., calibration: _Optional[_Union[CalibrationRange, str]] = ..., extrapolated: _Optional[_Mapping[str, float]] = ..., threshold: _Optional[_Union[AcceptanceThreshold, _Mapping]] = ..., belief: _Optional[_Union[Belief, _Mapping]] = ..., rig_correction: _Optional[str] = ...) -> None: ...
 
 class Belief(_message.Message):
     __slots__ = ("epoch", "modes", "elsewhere", "outside", "token")
