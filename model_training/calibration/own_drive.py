@@ -21,6 +21,7 @@ from service.errors import DatasetError, NoDepthError
 from service.localization.answer import Answer
 from service.localization.localizer import Localizer
 from service.maps.calibration import RIGHT_M
+from service.maps.rig_key import RigKey
 
 #: Largest number of frames that are localized a second time, evenly spread over a query set.
 MOST_ELSEWHERE = 300
@@ -38,6 +39,8 @@ class DriveFrames:
         described: description of the recording for readers.
         unlabelled: number of images without a label.
         unregistered: number of images with too few points to register.
+        name: name of the recording, and of its camera if one was chosen.
+        rig: the rig of the images.
     """
 
     frames: LabelledFrames
@@ -45,6 +48,56 @@ class DriveFrames:
     described: str
     unlabelled: int
     unregistered: int
+    name: str
+    rig: RigKey
+
+
+def images_of_drive(dataset: Dataset, names: Sequence[str], camera: str | None = None) -> list[QueryFrame]:
+    """Return the images of a recording that ``frames_of_drive`` labels, of one rig.
+
+    Args:
+        dataset: the recording.
+        names: names of the query sets; empty for all.
+        camera: name of a camera in ``dataset.json``; None for all, which must then be one rig.
+
+    Raises:
+        DatasetError: there are no query sets or no images, no image is of the camera, or the images come from several rigs.
+    """
+    names = list(names) or dataset.query_sets()
+    if not names:
+        raise DatasetError(f"{dataset.folder} has no query sets; import the recording with its images", field="queries")
+    images = list[QueryFrame]()
+    for name in names:
+        found = list(dataset.queries(name))
+        if not found:
+            folder = query_folder(dataset.folder, name)
+            raise DatasetError(f"{folder} has no images; choose another set with --queries", field="queries")
+        images += found
+    known = {each.camera.name: rig_of(each) for each in images}
+    if camera is not None and camera not in known:
+        raise DatasetError(
+            f"--camera: no image of {', '.join(names)} is of the camera {camera!r}; choose one of {', '.join(known)}",
+            field="camera",
+        )
+    chosen = [each for each in images if camera in (None, each.camera.name)]
+    first = rig_of(chosen[0])
+    if any(not first.is_same(rig) for name, rig in known.items() if camera in (None, name)):
+        rigs = "; ".join(f"{name}: {rig.described()}" for name, rig in known.items())
+        raise DatasetError(
+            f"{dataset.folder}: the images come from several rigs ({rigs}), and a correction is for one; choose one with --camera",
+            field="camera",
+        )
+    return chosen
+
+
+def rig_of(frame: QueryFrame) -> RigKey:
+    """Return the rig of an image, as its query states it.
+
+    Args:
+        frame: the image.
+    """
+    depth = frame.camera.depth
+    return RigKey.of(frame.camera.pinhole(), baseline_m=depth.baseline_m, max_range_m=depth.max_range_m)
 
 
 def frames_of_drive(
@@ -53,6 +106,8 @@ def frames_of_drive(
     names: Sequence[str],
     *,
     odometry_noise: float,
+    camera: str | None = None,
+    most_elsewhere: int | None = MOST_ELSEWHERE,
     workers: int = 2,
     report: Report = lambda *_: None,
 ) -> DriveFrames:
@@ -63,16 +118,18 @@ def frames_of_drive(
         dataset: the recording, in the map frame.
         names: names of the query sets; empty for all.
         odometry_noise: standard deviation of the odometry's end point, as a share of the travelled distance. Ground truth needs none.
+        camera: name of the camera whose images count; None for all, which must then be one rig.
+        most_elsewhere: largest number of images of a query set that are localized a second time; None for all.
         workers: number of queries that are localized at the same time.
         report: called after every query.
 
     Raises:
-        DatasetError: the dataset has no queries, or a set has neither ground truth nor odometry, or its odometry lacks a line.
+        DatasetError: as ``images_of_drive``, or a set has neither ground truth nor odometry, or its odometry lacks a line.
     """
+    rig = rig_of(images_of_drive(dataset, names, camera)[0])
     names = list(names) or dataset.query_sets()
-    if not names:
-        raise DatasetError(f"{dataset.folder} has no query sets; import the recording with its images", field="queries")
-    sets = [_QuerySet.of(dataset, name) for name in names]
+    sets = [found for name in names if (found := _QuerySet.of(dataset, name, camera)).frames]
+    names = [each.name for each in sets]
     parts, unlabelled, unregistered, outside = list[LabelledFrames](), 0, 0, 0
     for each in sets:
         answers = _answers(f"queries {each.name}", [(frame, localizer) for frame in each.frames], workers, report)
@@ -86,12 +143,13 @@ def frames_of_drive(
         block = blocks_of(len(answers))
         of_label = [row if known else None for row, known in zip(evidence, labelled, strict=True)]
         parts.append(frames_of(of_label, labels.right, is_out, block))
-        parts.append(_elsewhere(localizer, each, labels, is_out, block, workers, report))
+        parts.append(_elsewhere(localizer, each, labels, is_out, block, most_elsewhere, workers, report))
     how = {True: "ground truth", False: "odometry"}
     sources = " and ".join(dict.fromkeys(how[each.has_truth] for each in sets))
     noise = 0.0 if all(each.has_truth for each in sets) else LABEL_NOISE
     described = f"{dataset.name}, {', '.join(names)}, labelled by {sources}, {outside} images from outside the map"
-    return DriveFrames(joined_frames(parts), noise, described, unlabelled, unregistered)
+    named = dataset.name if camera is None else f"{dataset.name} {camera}"
+    return DriveFrames(joined_frames(parts), noise, described, unlabelled, unregistered, named, rig)
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,11 +162,12 @@ class _QuerySet:
     has_truth: bool
 
     @classmethod
-    def of(cls, dataset: Dataset, name: str) -> "_QuerySet":
-        frames = list(dataset.queries(name))
+    def of(cls, dataset: Dataset, name: str, camera: str | None) -> "_QuerySet":
+        """Read a query set; it has no frames if no image is of the camera."""
+        frames = [frame for frame in dataset.queries(name) if camera in (None, frame.camera.name)]
         folder = query_folder(dataset.folder, name)
         if not frames:
-            raise DatasetError(f"{folder} has no images; choose another set with --queries", field="queries")
+            return cls(name, frames, np.zeros((0, 4, 4)), True)
         truth = [frame.T_map_camera for frame in frames if frame.T_map_camera is not None]
         if truth:
             return cls(name, frames, np.array(truth), True)
@@ -148,11 +207,12 @@ def _elsewhere(
     labels: Labels,
     is_out: NDArray[np.bool_],
     block: NDArray[np.int64],
+    most: int | None,
     workers: int,
     report: Report,
 ) -> LabelledFrames:
     """Ask frames in the map again, in the map without the places around them."""
-    rows = _spread(np.flatnonzero(np.isfinite(labels.sigma_m) & ~is_out))
+    rows = _spread(np.flatnonzero(np.isfinite(labels.sigma_m) & ~is_out), most)
     rests = [without_surroundings(localizer, labels.reference_xy[k]) for k in rows]
     pairs = [(query_set.frames[k], rest) for k, rest in zip(rows, rests, strict=True) if rest is not None]
     answers = _answers(f"out-of-map {query_set.name}", pairs, workers, report)
@@ -161,9 +221,9 @@ def _elsewhere(
     return frames_of(evidence, np.zeros(len(pairs), bool), np.ones(len(pairs), bool), blocks)
 
 
-def _spread(rows: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Return at most ``MOST_ELSEWHERE`` of the rows, evenly spread."""
-    count = min(len(rows), MOST_ELSEWHERE)
+def _spread(rows: NDArray[np.int64], most: int | None) -> NDArray[np.int64]:
+    """Return at most this number of the rows, evenly spread."""
+    count = len(rows) if most is None else min(len(rows), most)
     return rows[np.linspace(0, len(rows) - 1, count).astype(int)] if count else rows
 
 

@@ -11,11 +11,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import minimize
 
-from model_training.calibration.bounds import upper_bound
+from model_training.calibration.bounds import bounded_thresholds, trials_needed, upper_bound
+from model_training.calibration.fit import RATES
 from service.confidence.decision import is_acceptable
 from service.confidence.features import FEATURES
 from service.errors import DatasetError
-from service.maps.calibration import Calibration, RigCorrection, corrected_log_odds, probability
+from service.maps.calibration import UNNAMED, Calibration, RigCorrection, corrected_log_odds, probability
+from service.maps.rig_key import RigKey
 from service.option_limits import FALSE_ACCEPT_RATE
 
 #: Standard deviations of the prior: of the offset in nats of log odds, and of the scale. The prior of the offset is that of a site
@@ -77,7 +79,10 @@ def learn_correction(
     *,
     source: Literal["drive", "rendered"],
     measured_on: str,
+    name: str = UNNAMED,
+    made_for: RigKey | None = None,
     label_noise: float = 0.0,
+    false_accept_rate: float | None = None,
 ) -> RigCorrection:
     """Fit the correction, measure it by cross-validation, and bound the share of wrong answers.
 
@@ -85,15 +90,23 @@ def learn_correction(
     a threshold would accept more out-of-map frames than its rate. If the correction does not improve the cross-validated log loss,
     there is none: scale 1 and offset 0.
 
+    Thresholds come from all out-of-map frames and their confidence with the correction. The correction was fitted on the same frames, but
+    it keeps the order of answers. So the thresholds accept the same answers as thresholds of the confidence without it, which has not seen
+    the frames. The bound holds.
+
     Args:
-        calibration: calibration of the map. Its earlier correction for a rig does not count.
+        calibration: calibration of the map. Its corrections for rigs do not count.
         frames: the labelled frames.
         source: origin of the frames.
         measured_on: description of the frames.
+        name: name of the correction.
+        made_for: the rig of the frames; None for a correction that is not stored in a map.
         label_noise: share of wrong labels.
+        false_accept_rate: rate that the out-of-map frames must support. The correction then has thresholds for this rate, and for all
+            rates of a calibration that the frames support. None: the thresholds of the map stay.
 
     Raises:
-        DatasetError: no frame in the map has confidence features.
+        DatasetError: no frame in the map has confidence features, or the out-of-map frames do not support the rate.
     """
     inside = ~frames.outside
     if not inside.any():
@@ -101,7 +114,9 @@ def learn_correction(
             f"{measured_on}: no frame in the map could be registered and labelled; give images from the map, with poses in its frame",
             field="queries",
         )
-    stock, weight = calibration.model_copy(update={"rig": None}), weights_of(frames.outside)
+    if false_accept_rate is not None:
+        require_support(int(frames.outside.sum()), false_accept_rate, "out-of-map frames")
+    stock, weight = _without_corrections(calibration), weights_of(frames.outside)
     found = validated(calibration, frames, source=source, label_noise=label_noise)
     lower_only, before, after = found.lower_only, found.before, found.after
     scale, offset = 1.0, 0.0
@@ -109,10 +124,9 @@ def learn_correction(
         scale, offset = fit_correction(
             log_odds_of(before), frames.right, weight, lower_only=lower_only, label_noise=label_noise
         )
-    acceptable = [is_acceptable(stock, row, FALSE_ACCEPT_RATE) for row in frames.evidence]
-    accepted = (after >= stock.threshold(FALSE_ACCEPT_RATE)) & np.array(acceptable)
-    counts = [int(each.sum()) for each in (accepted & inside, accepted & inside & ~frames.right, accepted & ~inside)]
-    return RigCorrection(
+    correction = RigCorrection(
+        name=name,
+        made_for=made_for,
         scale=scale,
         offset=offset,
         lower_only=lower_only,
@@ -123,11 +137,35 @@ def learn_correction(
         outside=int(frames.outside.sum()),
         error_before=calibration_error(before, frames.right, weight),
         error_after=calibration_error(after, frames.right, weight),
-        accepted=counts[0],
-        accepted_wrong=counts[1],
-        wrong_share_upper=upper_bound(counts[1], counts[0]),
-        outside_accepted=counts[2],
-        outside_share_upper=upper_bound(counts[2], int(frames.outside.sum())),
+        accepted=0,
+        accepted_wrong=0,
+        wrong_share_upper=1.0,
+        outside_accepted=0,
+        outside_share_upper=1.0,
+    )
+    if false_accept_rate is not None:
+        count = int(frames.outside.sum())
+        confidence = stock.model_copy(update={"rig": correction}).confidence(frames.evidence[frames.outside])
+        rates = sorted({*RATES, false_accept_rate})
+        thresholds = bounded_thresholds(np.asarray(confidence), np.full(count, 1.0 / count), rates)
+        correction = correction.model_copy(update={"thresholds": thresholds})
+    level = stock.model_copy(update={"rig": correction}).threshold(FALSE_ACCEPT_RATE)
+    acceptable = [is_acceptable(stock, row, FALSE_ACCEPT_RATE) for row in frames.evidence]
+    return _with_counts(correction, frames, (after >= level) & np.array(acceptable))
+
+
+def _with_counts(correction: RigCorrection, frames: LabelledFrames, accepted: NDArray[np.bool_]) -> RigCorrection:
+    """Return the correction with the numbers of accepted frames and the bounds of their shares."""
+    inside = ~frames.outside
+    counts = [int(each.sum()) for each in (accepted & inside, accepted & inside & ~frames.right, accepted & ~inside)]
+    return correction.model_copy(
+        update={
+            "accepted": counts[0],
+            "accepted_wrong": counts[1],
+            "wrong_share_upper": upper_bound(counts[1], counts[0]),
+            "outside_accepted": counts[2],
+            "outside_share_upper": upper_bound(counts[2], int(frames.outside.sum())),
+        }
     )
 
 
@@ -158,12 +196,12 @@ def validated(
     """Cross-validate the correction over blocks of consecutive frames.
 
     Args:
-        calibration: calibration of the map. Its earlier correction for a rig does not count.
+        calibration: calibration of the map. Its corrections for rigs do not count.
         frames: the labelled frames, some of them in the map.
         source: origin of the frames.
         label_noise: share of wrong labels.
     """
-    stock = calibration.model_copy(update={"rig": None})
+    stock = _without_corrections(calibration)
     before = np.asarray(stock.confidence(frames.evidence))
     odds, weight = log_odds_of(before), weights_of(frames.outside)
     lower_only = source == "rendered" or not frames.outside.any()
@@ -175,6 +213,10 @@ def validated(
         before, frames.right, weight, label_noise
     )
     return Validated(before, after if improves else before, lower_only, improves)
+
+
+def _without_corrections(calibration: Calibration) -> Calibration:
+    return calibration.model_copy(update={"rig": None, "rigs": ()})
 
 
 def log_odds_of(confidence: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -281,6 +323,34 @@ def support_of(frames: int, rate: float, what: str) -> str | None:
     return f"{frames} {what} cannot support a rate of {rate:g}: the least rate they support is {least:.2g}"
 
 
+def require_support(frames: int, rate: float, what: str) -> None:
+    """Refuse a false-accept rate that some frames cannot support, even if none of them is accepted.
+
+    Args:
+        frames: number of frames.
+        rate: the rate to support, 0 to 1.
+        what: name of the frames in the plural.
+
+    Raises:
+        DatasetError: the frames are too few. The message says how many the rate needs, and which rate they support.
+    """
+    least = upper_bound(0, frames)
+    if least <= rate:
+        return
+    supported = "no rate" if frames == 0 else f"a rate of {_rounded_up(least):.2g} or more"
+    raise DatasetError(
+        f"--false-accept-rate {rate:g}: it needs {trials_needed(rate)} {what}, and the recording has {frames}; record more images, or give "
+        f"a rate that they support ({supported})",
+        field="false_accept_rate",
+    )
+
+
+def _rounded_up(share: float) -> float:
+    """Return a share rounded up to two digits, so that the frames support the stated rate."""
+    unit = 10.0 ** (np.floor(np.log10(share)) - 1)
+    return float(np.ceil(share / unit) * unit)
+
+
 def report_lines(correction: RigCorrection) -> list[str]:
     """Return lines of text about a correction and about the claims that its frames support.
 
@@ -291,12 +361,19 @@ def report_lines(correction: RigCorrection) -> list[str]:
     is_none = (c.scale, c.offset) == (1.0, 0.0)
     formula = f"log odds' = {c.scale:.3f} x log odds {'+' if c.offset >= 0 else '-'} {abs(c.offset):.3f}"
     may = ", where this lowers the confidence" if c.lower_only and not is_none else ""
+    rig = [] if c.made_for is None else [f"rig: {c.name}, {c.made_for.described()}"]
     lines = [
+        *rig,
         f"frames: {c.frames} labelled, {c.right} with a right answer, {c.outside} out-of-map",
         f"correction: {'none, because none predicts held-out frames better' if is_none else formula}{may}",
         f"calibration error: {c.error_before:.3f} before, {c.error_after:.3f} after (cross-validated)",
         f"accepted in the map: {c.accepted}, {c.accepted_wrong} of them wrong; upper bound of the share {c.wrong_share_upper:.2g} (95 %)",
         f"accepted out-of-map: {c.outside_accepted} of {c.outside}; upper bound of the share {c.outside_share_upper:.2g} (95 %)",
+    ]
+    lines += [
+        f"threshold for a false-accept rate of {each.false_accept_rate:g}: confidence {each.confidence:.3f} ({c.outside} out-of-map "
+        "frames, 95 %)"
+        for each in c.thresholds
     ]
     claims = (
         support_of(c.accepted, WRONG_RATE, "accepted frames"),
@@ -306,13 +383,35 @@ def report_lines(correction: RigCorrection) -> list[str]:
 
 
 def with_correction(calibration: Calibration, correction: RigCorrection) -> Calibration:
-    """Return the calibration with a correction for a rig. It replaces an earlier one.
+    """Return the calibration with a correction for a rig. It replaces that of the same rig. Those of other rigs stay.
 
     Args:
         calibration: calibration of the map.
-        correction: the correction.
+        correction: the correction, with its rig.
+
+    Raises:
+        ValueError: the correction does not say which rig it is for.
     """
-    return calibration.model_copy(update={"rig": correction})
+    if correction.made_for is None:
+        raise ValueError("correction: made_for is missing; learn the correction with the key of its rig")
+    replaced = replaced_by(calibration, correction)
+    kept = tuple(each for each in calibration.rigs if each not in replaced)
+    return calibration.model_copy(update={"rigs": (*kept, correction)})
+
+
+def replaced_by(calibration: Calibration, correction: RigCorrection) -> tuple[RigCorrection, ...]:
+    """Return the corrections of a map that a new one replaces: those for the same rig (``RigKey.is_same``).
+
+    Args:
+        calibration: calibration of the map.
+        correction: the new correction.
+    """
+    key = correction.made_for
+    return tuple(
+        each
+        for each in calibration.rigs
+        if key is not None and each.made_for is not None and key.is_same(each.made_for)
+    )
 
 
 def joined_frames(parts: list[LabelledFrames]) -> LabelledFrames:

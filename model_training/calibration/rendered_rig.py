@@ -32,6 +32,7 @@ from service.localization.answer import Answer
 from service.localization.localizer import Localizer
 from service.maps.calibration import RIGHT_M
 from service.maps.manifest import Manifest
+from service.maps.rig_key import RigKey
 from service.option_limits import LEAST_HEIGHT_M, MOST_HEIGHT_M
 from service.registration.points import FOCAL_BASELINE_PX_M
 from service.registration.surfel_map import SurfelMap
@@ -136,6 +137,12 @@ class RigFile(_Frozen):
         c = self.camera
         whole = PinholeCamera(c.width, c.height, c.fx, c.fy, c.cx, c.cy)
         return whole if c.width <= _WIDTH else whole.scaled_to(_WIDTH, max(1, round(_WIDTH * c.height / c.width)))
+
+    def key(self) -> RigKey:
+        """Return what tells the rig from others. A rendered image may be smaller, but the queries of the rig are not."""
+        c = self.camera
+        whole = PinholeCamera(c.width, c.height, c.fx, c.fy, c.cx, c.cy)
+        return RigKey.of(whole, baseline_m=self.depth.baseline_m, max_range_m=self.depth.max_range_m)
 
     def measured(
         self, z_m: NDArray[np.float32], group: NDArray[np.int64], rng: np.random.Generator

@@ -2,6 +2,7 @@
 
 import time
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
@@ -10,8 +11,14 @@ import typer
 from rich.console import Console
 
 from model_training.calibration.make import calibrate
-from model_training.calibration.own_drive import frames_of_drive
-from model_training.calibration.own_rig import learn_correction, report_lines, with_correction
+from model_training.calibration.own_drive import MOST_ELSEWHERE, frames_of_drive, images_of_drive
+from model_training.calibration.own_rig import (
+    learn_correction,
+    replaced_by,
+    report_lines,
+    require_support,
+    with_correction,
+)
 from model_training.calibration.rendered_rig import RigFile, frames_of_rig, read_rig
 from model_training.cli.progress import bars
 from model_training.datasets.dataset import Dataset, require_map_first
@@ -20,10 +27,11 @@ from model_training.mapping.calibration_file import renew_calibration
 from model_training.stock import CALIBRATION, ENCODER
 from service.errors import BundleError, DatasetError
 from service.localization.localizer import Localizer
-from service.maps.calibration import Calibration
+from service.maps.calibration import Calibration, RigCorrection
 from service.maps.map import Map
 from service.maps.tiles import MOST_AROUND, TiledMap, open_map
 from service.maps.writer import replace_calibration
+from service.option_limits import LEAST_FALSE_ACCEPT_RATE
 
 #: Folder of cities, maps and answers if none is given.
 WORK = Path("data/calibration")
@@ -73,6 +81,19 @@ def command(
             max=0.5,
         ),
     ] = None,
+    camera: Annotated[
+        str | None,
+        typer.Option(help="Camera of --drive whose images count. Needed if the images come from several rigs."),
+    ] = None,
+    false_accept_rate: Annotated[
+        float | None,
+        typer.Option(
+            help="Share of out-of-map queries of this rig that may be LOCALIZED. The thresholds for this rig then come from --drive. "
+            "The command refuses a rate that its images cannot support: 0.01 needs 299 of them.",
+            min=LEAST_FALSE_ACCEPT_RATE,
+            max=0.5,
+        ),
+    ] = None,
     rig: Annotated[
         Path | None,
         typer.Option(
@@ -92,17 +113,24 @@ def command(
 ) -> None:
     """Fit the confidence of an encoder on calibration cities, or correct or renew the confidence of a map.
 
-    The first simulates the cities, which takes about two hours. A correction takes seconds to minutes, a renewal a second.
+    The first simulates the cities, which takes about two hours. A correction takes seconds to minutes, a renewal a second. A correction
+    holds for queries of its rig. It replaces that of the same rig, and those of other rigs stay.
 
     \b
     Examples:
       streetfix calibrate --encoder runs/mine/encoder.onnx --out runs/mine/calibration.json
       streetfix build-map data/site --encoder runs/mine/encoder.onnx --calibration runs/mine/calibration.json --out maps/site
       streetfix calibrate --map maps/site --drive data/robot --queries recorded
+      streetfix calibrate --map maps/site --drive data/robot --false-accept-rate 0.01
       streetfix calibrate --map maps/site --rig rig.json --out rig_calibration.json
       streetfix calibrate --map maps/site --calibration stock
     """
-    of_drive = {"--queries": queries, "--odometry-noise": odometry_noise}
+    of_drive = {
+        "--queries": queries,
+        "--odometry-noise": odometry_noise,
+        "--camera": camera,
+        "--false-accept-rate": false_accept_rate,
+    }
     if out is not None and not out.parent.is_dir():  # said before the work, not after it
         raise DatasetError(f"--out: folder {out.parent} not found; create it first", field="out")
     if map_bundle is None:
@@ -128,7 +156,9 @@ def command(
         )
     frames_from = _source(map_bundle, drive, rig)
     noise = ODOMETRY_NOISE if odometry_noise is None else odometry_noise
-    _calibrate_rig(map_bundle, frames_from, queries or [], noise, out, workers or WORKERS)
+    _calibrate_rig(
+        map_bundle, frames_from, _OfDrive(queries or [], noise, camera, false_accept_rate), out, workers or WORKERS
+    )
 
 
 def _given(options: Mapping[str, object]) -> str:
@@ -160,16 +190,24 @@ def _renew(folder: Path, calibration: Path) -> None:
     console = Console(highlight=False, soft_wrap=True)
     manifest, had_rig = renew_calibration(folder, calibration)
     if had_rig:
-        console.print("removed: the correction for a rig; learn it again with --drive or --rig")
+        console.print("removed: the corrections for rigs; learn them again with --drive or --rig")
     console.print(f"{describe(manifest)}: {folder}")
 
 
-def _calibrate_rig(
-    folder: Path, source: Dataset | RigFile, queries: list[str], odometry_noise: float, out: Path | None, workers: int
-) -> None:
+@dataclass(frozen=True)
+class _OfDrive:
+    """Options of a recording: query sets (empty: all), noise of the odometry, camera and false-accept rate (None: not given)."""
+
+    queries: list[str]
+    odometry_noise: float
+    camera: str | None
+    false_accept_rate: float | None
+
+
+def _calibrate_rig(folder: Path, source: Dataset | RigFile, given: _OfDrive, out: Path | None, workers: int) -> None:
     began = time.monotonic()
     console = Console(highlight=False, soft_wrap=True)
-    bundle = part_for(open_map(folder), source, queries)
+    bundle = part_for(open_map(folder), source, given.queries)
     calibration = bundle.calibration
     if calibration is None:
         raise BundleError(
@@ -181,12 +219,28 @@ def _calibrate_rig(
     if isinstance(source, RigFile):
         with bars() as report:
             frames = frames_of_rig(localizer, source, workers=workers, report=report)
-        measured_on = f"images rendered for {source.name}"
-        correction = learn_correction(calibration, frames, source="rendered", measured_on=measured_on)
+        correction = learn_correction(
+            calibration,
+            frames,
+            source="rendered",
+            measured_on=f"images rendered for {source.name}",
+            name=source.name,
+            made_for=source.key(),
+        )
     else:
+        images, rate = images_of_drive(source, given.queries, given.camera), given.false_accept_rate
+        if rate is not None:  # an image gives one out-of-map frame at most
+            require_support(len(images), rate, "images")
         with bars() as report:
             found = frames_of_drive(
-                localizer, source, queries, odometry_noise=odometry_noise, workers=workers, report=report
+                localizer,
+                source,
+                given.queries,
+                odometry_noise=given.odometry_noise,
+                camera=given.camera,
+                most_elsewhere=MOST_ELSEWHERE if rate is None else None,
+                workers=workers,
+                report=report,
             )
         console.print(f"recording: {found.described}")
         for count, what in (
@@ -196,9 +250,18 @@ def _calibrate_rig(
             if count:
                 console.print(f"left out: {count} images {what}")
         correction = learn_correction(
-            calibration, found.frames, source="drive", measured_on=found.described, label_noise=found.label_noise
+            calibration,
+            found.frames,
+            source="drive",
+            measured_on=found.described,
+            name=found.name,
+            made_for=found.rig,
+            label_noise=found.label_noise,
+            false_accept_rate=rate,
         )
     for line in report_lines(correction):
+        console.print(line)
+    for line in _change_lines(calibration, correction):
         console.print(line)
     console.print(f"took_s: {time.monotonic() - began:.1f}")
     corrected = with_correction(calibration, correction)
@@ -207,6 +270,20 @@ def _calibrate_rig(
     else:
         _write(out, corrected)
         console.print(f"written: {out}")
+
+
+def _change_lines(calibration: Calibration, correction: RigCorrection) -> list[str]:
+    """Return what a new correction does to those that the map has."""
+    replaced = replaced_by(calibration, correction)
+    lines = [f"replaced: the correction {each.name} of the same rig ({each.measured_on})" for each in replaced]
+    kept = [each.name for each in calibration.rigs if each not in replaced]
+    lines += [f"kept: the corrections of other rigs ({', '.join(kept)})"] if kept else []
+    if calibration.rig is not None:
+        lines.append(
+            f"kept: a correction of an earlier release ({calibration.rig.measured_on}); it applies to every camera without a correction of "
+            "its own"
+        )
+    return lines
 
 
 def part_for(opened: Map, source: Dataset | RigFile, queries: Sequence[str] = ()) -> Map:

@@ -2,22 +2,28 @@
 
 import json
 import shutil
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from model_training.calibration import elsewhere
+from model_training.calibration import elsewhere, rendered_rig
 from model_training.calibration.odometry_labels import LABEL_NOISE
-from model_training.calibration.own_drive import frames_of_drive
+from model_training.calibration.own_drive import frames_of_drive, images_of_drive
 from model_training.calibration.own_rig import learn_correction
+from model_training.cli import calibrate
 from model_training.datasets.dataset import Dataset, query_folder, read_tum, write_tum
 from service.cli.main import main
 from service.confidence.features import FEATURES
-from service.errors import DatasetError
+from service.errors import DatasetError, RequestError
+from service.geometry.camera import PinholeCamera
 from service.geometry.rigid import inverse
 from service.localization.localizer import Localizer
 from service.maps.calibration import read_calibration
 from service.maps.reader import MapBundle
+from service.maps.rig_key import RigKey
+
+KEY = ("width", "height", "fx", "fy", "cx", "cy")
 
 
 def run(*arguments):
@@ -128,8 +134,8 @@ def test_a_recording_corrects_the_map(town, small_dataset, few_places, capsys):
     out = capsys.readouterr().out
     after = MapBundle.open(town)
     assert after.calibration is not None
-    rig = after.calibration.rig
-    assert rig is not None
+    (rig,) = after.calibration.rigs
+    assert after.calibration.rig is None
     assert (rig.source, rig.frames - rig.outside) == ("drive", 5)
     assert after.manifest.version != before.manifest.version
     for line in (
@@ -143,9 +149,103 @@ def test_a_recording_corrects_the_map(town, small_dataset, few_places, capsys):
     # What is stored is what the frames give.
     found = frames_of_drive(Localizer.open(before), small_dataset, [], odometry_noise=0.02, workers=1)
     assert before.calibration is not None
-    assert learn_correction(before.calibration, found.frames, source="drive", measured_on=found.described) == rig
+    again = learn_correction(
+        before.calibration,
+        found.frames,
+        source="drive",
+        measured_on=found.described,
+        name="small",
+        made_for=found.rig,
+    )
+    assert again == rig
     assert run("map", "info", town) == 0
-    assert f"corrected for a rig by {rig.frames} frames" in capsys.readouterr().out
+    assert f"corrected for small by {rig.frames} frames" in capsys.readouterr().out
+
+
+def test_a_rig_is_added_to_that_of_a_recording_and_the_answers_of_each_state_their_correction(
+    town, small_dataset, few_places, tmp_path, capsys, monkeypatch
+):
+    monkeypatch.setattr(rendered_rig, "IMAGES", 4)
+    depth = {"noise_share": 0.01, "min_range_m": 0.4, "max_range_m": 30}
+    wide = {"width": 96, "height": 72, "fx": 40, "fy": 40, "cx": 47.5, "cy": 35.5, "height_m": 1.5}
+    (tmp_path / "rig.json").write_text(json.dumps({"name": "wide", "camera": wide, "depth": depth}))
+    given = ("calibrate", "--map", town, "--workers", "1")
+    assert run(*given, "--drive", small_dataset.folder) == 0
+    assert run(*given, "--rig", tmp_path / "rig.json") == 0
+    assert "kept: the corrections of other rigs (small)" in capsys.readouterr().out
+    assert run(*given, "--drive", small_dataset.folder) == 0
+    out = capsys.readouterr().out
+    assert "replaced: the correction small of the same rig" in out
+    assert "kept: the corrections of other rigs (wide)" in out
+    bundle = MapBundle.open(town)
+    assert bundle.calibration is not None
+    assert [each.name for each in bundle.calibration.rigs] == ["wide", "small"]
+    localizer = Localizer.open(bundle)
+    query = next(iter(small_dataset.queries(*small_dataset.query_sets()))).query(bundle.grid)
+    wider, other = (PinholeCamera(96, 72, focal, focal, 47.5, 35.5) for focal in (40.0, 60.0))
+    for name, camera in (("small", query.camera), ("wide", wider), (None, other)):
+        assert localizer.localize(replace(query, camera=camera)).rig_correction == name
+
+
+def test_a_rate_that_the_images_cannot_support_is_refused_before_the_work(town, small_dataset, capsys, monkeypatch):
+    def nothing_is_asked(*_, **__):
+        raise AssertionError("the work began")
+
+    monkeypatch.setattr(calibrate, "frames_of_drive", nothing_is_asked)
+    version = MapBundle.open(town).manifest.version
+    given = ("--drive", small_dataset.folder, "--false-accept-rate", "0.01")
+    assert run("calibrate", "--map", town, *given) == 1
+    said = " ".join(capsys.readouterr().err.split())
+    assert "--false-accept-rate 0.01: it needs 299 images, and the recording has 5; record more images" in said
+    assert "(a rate of 0.46 or more)" in said  # 1 - 0.05 ** (1 / 5) = 0.451
+    assert MapBundle.open(town).manifest.version == version
+
+
+def test_a_rate_that_the_images_support_sets_the_thresholds_of_this_rig(town, drive, few_places, capsys):
+    """Ten images give six out-of-map frames at least, and five support 0.46. The answers of this rig then have this rate."""
+    (name,) = Dataset(drive).query_sets()
+    shutil.copytree(query_folder(drive, name), query_folder(drive, "again"))
+    given = ("calibrate", "--map", town, "--drive", drive, "--workers", "1", "--false-accept-rate", "0.46")
+    assert run(*given) == 0
+    assert "threshold for a false-accept rate of 0.46: confidence" in capsys.readouterr().out
+    bundle = MapBundle.open(town)
+    assert bundle.calibration is not None
+    (rig,) = bundle.calibration.rigs
+    assert rig.outside >= 6
+    assert rig.thresholds[-1].false_accept_rate == 0.46
+    localizer = Localizer.open(bundle)
+    query = replace(next(iter(Dataset(drive).queries(name))).query(bundle.grid), rate_is_named=True)
+    answer = localizer.localize(replace(query, false_accept_rate=0.46))
+    assert answer.threshold == rig.thresholds[-1]
+    with pytest.raises(
+        RequestError, match=r"0\.01 is below what the recording of this rig supports \(small, \d+ out-of-map frames"
+    ):
+        localizer.localize(replace(query, false_accept_rate=0.01))
+    # The default of the service is for all rigs. It is answered, by the stricter threshold.
+    unnamed = localizer.localize(replace(query, false_accept_rate=0.01, rate_is_named=False))
+    assert unnamed.threshold is not None
+    assert unnamed.threshold.confidence == max(rig.thresholds[0].confidence, bundle.calibration.threshold(0.01))
+    # Another rig has the thresholds of the map.
+    other = replace(query, camera=PinholeCamera(96, 72, 60.0, 60.0, 47.5, 35.5), false_accept_rate=0.01)
+    assert localizer.localize(other).threshold == bundle.calibration.threshold_at(0.01)
+
+
+def test_images_of_several_rigs_need_a_camera(localizer, drive):
+    """The second camera has half the focal length. Its images are 0, 2 and 4."""
+    path = drive / "dataset.json"
+    description = json.loads(path.read_text())
+    (first,) = description["sensors"]["cameras"]
+    other = first | {"name": "rear", "fx": first["fx"] / 2, "fy": first["fy"] / 2}
+    path.write_text(json.dumps(description | {"sensors": description["sensors"] | {"cameras": [first, other]}}))
+    poses_of(drive).with_name("cameras.txt").write_text("\n".join(["rear", first["name"]] * 2 + ["rear"]))
+    with pytest.raises(DatasetError, match=r"come from several rigs \(rear: 96 x 72 pixels.*choose one with --camera"):
+        images_of_drive(Dataset(drive), [])
+    with pytest.raises(DatasetError, match=r"--camera: no image of .* is of the camera 'side'; choose one of rear, "):
+        images_of_drive(Dataset(drive), [], "side")
+    assert [frame.number for frame in images_of_drive(Dataset(drive), [], "rear")] == [0, 2, 4]
+    found = frames_of_drive(localizer, Dataset(drive), [], odometry_noise=0.02, camera=first["name"], workers=1)
+    assert (found.name, found.rig.fx) == (f"small {first['name']}", first["fx"])
+    assert (~found.frames.outside).sum() == 2
 
 
 def test_a_rig_file_makes_a_calibration_that_build_map_takes(town, small_dataset, few_places, tmp_path, capsys):
@@ -160,12 +260,13 @@ def test_a_rig_file_makes_a_calibration_that_build_map_takes(town, small_dataset
     assert MapBundle.open(town).manifest.version == version, "--out leaves the map as it is"
     calibration = read_calibration(out.read_bytes(), path=str(out))
     assert calibration is not None
-    assert calibration.rig is not None
-    assert calibration.rig.source == "rendered"
-    assert calibration.rig.scale <= 1 + 1e-6  # the optimiser's tolerance
+    (rig,) = calibration.rigs
+    assert (rig.source, rig.name) == ("rendered", "rig")
+    assert rig.made_for == RigKey(**{name: camera[name] for name in KEY}, max_range_m=30.0)
+    assert rig.scale <= 1 + 1e-6  # the optimiser's tolerance
     assert sorted(path.name for path in tmp_path.iterdir()) == ["calibration.json", "rig.json", "town"]
     given = ("--calibration", out, "--headings", "2", "--spacing", "20", "--no-align-survey")
     assert run("build-map", small_dataset.folder, "--out", tmp_path / "again", *given) == 0
     built = MapBundle.open(tmp_path / "again")
     assert built.calibration is not None
-    assert built.calibration.rig == calibration.rig
+    assert built.calibration.rigs == calibration.rigs

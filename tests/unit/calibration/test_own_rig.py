@@ -3,7 +3,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from model_training.calibration.bounds import upper_bound
+from model_training.calibration.bounds import bounded_thresholds, upper_bound
 from model_training.calibration.own_rig import (
     BLOCKS,
     LEAST_SCALE,
@@ -15,6 +15,7 @@ from model_training.calibration.own_rig import (
     joined_frames,
     learn_correction,
     log_odds_of,
+    replaced_by,
     report_lines,
     support_of,
     weights_of,
@@ -23,8 +24,10 @@ from model_training.calibration.own_rig import (
 from service.confidence.features import FEATURES
 from service.errors import DatasetError
 from service.maps.calibration import corrected_log_odds, probability
-from service.option_limits import FALSE_ACCEPT_RATE
+from service.maps.rig_key import RigKey
+from service.option_limits import FALSE_ACCEPT_RATE, SAFE_CONFIDENCE
 
+KEY = RigKey(width=640, height=480, fx=320.0, fy=320.0, cx=319.5, cy=239.5)
 SHARE = FEATURES.index("log_share")
 
 
@@ -244,9 +247,100 @@ def test_a_correction_that_does_not_help_held_out_blocks_is_left_out(stock):
 
 
 def test_an_earlier_correction_does_not_count(stock):
-    once = with_correction(stock, learned(stock, overconfident()))
-    assert once.rig is not None
-    assert learned(once, overconfident()) == once.rig
+    once = with_correction(stock, learned(stock, overconfident(), name="mule", made_for=KEY))
+    (rig,) = once.rigs
+    for each in (once, stock.model_copy(update={"rig": rig})):
+        assert learned(each, overconfident(), name="mule", made_for=KEY) == rig
+
+
+def test_another_rig_is_added_and_the_same_rig_replaced(stock):
+    wide, again = KEY.model_copy(update={"fx": 200.0}), KEY.model_copy(update={"fx": 325.0, "max_range_m": 20.0})
+    first, second, third = (
+        learned(stock, overconfident(), name=name, made_for=rig)
+        for name, rig in (("first", KEY), ("second", wide), ("third", again))
+    )
+    both = with_correction(with_correction(stock, first), second)
+    assert both.rigs == (first, second)
+    assert replaced_by(both, third) == (first,)
+    assert with_correction(both, third).rigs == (second, third)
+    with pytest.raises(ValueError, match="made_for is missing"):
+        with_correction(stock, learned(stock, overconfident()))
+
+
+def test_a_correction_of_an_earlier_release_stays(stock):
+    old = stock.model_copy(update={"rig": learned(stock, overconfident())})
+    new = with_correction(old, learned(stock, overconfident(), made_for=KEY))
+    assert (new.rig, len(new.rigs)) == (old.rig, 1)
+
+
+def separated(outside):
+    """Answers in the map have log odds of 5. Those outside have -8 to -2, the last one the largest."""
+    odds = np.r_[np.full(50, 5.0), np.linspace(-8, -2, outside)]
+    return labelled(odds, odds > 0, odds < 0)
+
+
+def test_thresholds_of_a_recording_by_hand(stock):
+    """Of 100 out-of-map frames the bound of 0 accepted ones is 3.0 %, of 1 4.7 %, of 2 6.2 %, of 5 10.2 %: 0, 1 and 4 may pass."""
+    frames = separated(100)
+    found = learned(stock, frames, false_accept_rate=0.03)
+    assert [each.false_accept_rate for each in found.thresholds] == [0.03, 0.05, 0.1]
+    corrected = stock.model_copy(update={"rig": found}).confidence(frames.evidence[frames.outside])
+    passed = [int((corrected >= each.confidence).sum()) for each in found.thresholds]
+    assert passed == [0, 1, 4]
+    assert [each.confidence for each in found.thresholds] == pytest.approx(corrected[[-1, -2, -5]], rel=1e-9)
+    (line, *_) = [line for line in report_lines(found) if line.startswith("threshold")]
+    assert line == (
+        f"threshold for a false-accept rate of 0.03: confidence {found.thresholds[0].confidence:.3f} (100 out-of-map frames, 95 %)"
+    )
+
+
+def test_a_rate_between_those_of_a_calibration_has_a_threshold_too(stock):
+    found = learned(stock, separated(100), false_accept_rate=0.04)
+    assert [each.false_accept_rate for each in found.thresholds] == [0.03, 0.04, 0.05, 0.1]
+
+
+def test_without_a_rate_the_thresholds_of_the_map_stay(stock):
+    assert learned(stock, separated(400)).thresholds == ()
+
+
+def test_at_the_default_rate_the_threshold_is_at_least_the_safe_confidence(stock):
+    found = learned(stock, separated(299), false_accept_rate=FALSE_ACCEPT_RATE)
+    assert found.thresholds[0].false_accept_rate == FALSE_ACCEPT_RATE
+    assert found.thresholds[0].confidence == SAFE_CONFIDENCE
+    assert found.thresholds[1].confidence < SAFE_CONFIDENCE
+    assert found.accepted == 50
+
+
+@pytest.mark.parametrize(
+    ("outside", "rate", "message"),
+    [
+        (
+            298,
+            0.01,
+            r"0\.01: it needs 299 out-of-map frames, and the recording has 298; .* \(a rate of 0\.011 or more\)",
+        ),
+        (26, 0.05, r"0\.05: it needs 59 out-of-map frames, and the recording has 26; .* \(a rate of 0\.11 or more\)"),
+        (0, 0.5, r"0\.5: it needs 5 out-of-map frames, and the recording has 0; .* \(no rate\)"),
+    ],
+)
+def test_a_rate_that_the_frames_cannot_support_is_refused_with_the_number_that_it_needs(stock, outside, rate, message):
+    with pytest.raises(DatasetError, match=message) as caught:
+        learned(stock, separated(outside), false_accept_rate=rate)
+    assert caught.value.field == "false_accept_rate"
+
+
+def test_thresholds_accept_what_thresholds_of_the_confidence_without_the_correction_accept(stock):
+    """The correction saw the frames, but the stock confidence did not. So the bound of the latter holds."""
+    rng = np.random.default_rng(5)
+    odds = np.r_[rng.normal(8, 2, 60), rng.normal(0, 3, 100)]
+    frames = labelled(odds, (np.arange(160) < 60) & (rng.random(160) < 0.8), np.arange(160) >= 60)
+    found = learned(stock, frames, false_accept_rate=0.03)
+    assert (found.scale, found.offset) != (1.0, 0.0)
+    before = stock.confidence(frames.evidence)
+    after = stock.model_copy(update={"rig": found}).confidence(frames.evidence)
+    plain = bounded_thresholds(before[frames.outside], np.full(100, 0.01), (0.03, 0.05, 0.1))
+    for one, other in zip(plain, found.thresholds, strict=True):
+        np.testing.assert_array_equal(before >= one.confidence, after >= other.confidence)
 
 
 def test_an_answer_without_more_than_half_of_the_support_is_not_accepted(stock):

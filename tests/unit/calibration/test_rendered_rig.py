@@ -32,6 +32,13 @@ def written(folder, **changed):
     return path
 
 
+def test_the_key_of_a_rig_is_that_of_its_queries_even_if_the_rendered_image_is_smaller():
+    rig = rig_of(width=1920, height=1080, fx=960.0, fy=960.0, cx=959.5, cy=539.5)
+    assert rig.pinhole().width == 1280
+    key = rig.key()
+    assert (key.width, key.fx, key.baseline_m, key.max_range_m) == (1920, 960.0, 0.1, STEREO["max_range_m"])
+
+
 def test_a_rig_file_is_read(tmp_path):
     rig = read_rig(written(tmp_path, name="mule"))
     assert (rig.name, rig.camera.fx, rig.depth.baseline_m, rig.rectified) == ("mule", 32.0, 0.1, True)

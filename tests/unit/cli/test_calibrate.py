@@ -42,6 +42,10 @@ def run(*arguments: str | Path) -> int:
         (("--map", "m", "--calibration", "c", "--out", "o"), "leave out --out"),
         (("--map", "m", "--rig", "x", "--queries", "q"), "--queries belongs to --drive"),
         (("--map", "m", "--rig", "x", "--odometry-noise", "0.1"), "--odometry-noise belongs to --drive"),
+        (("--map", "m", "--rig", "x", "--camera", "c"), "--camera belongs to --drive"),
+        (("--map", "m", "--rig", "x", "--false-accept-rate", "0.1"), "--false-accept-rate belongs to --drive"),
+        (("--false-accept-rate", "0.1"), "--false-accept-rate changes the confidence of a map"),
+        (("--map", "m", "--drive", "x", "--false-accept-rate", "0.6"), "should be less than or equal to 0.5"),
     ],
 )
 def test_options_that_do_not_go_together_are_refused(
@@ -116,13 +120,24 @@ def test_an_interrupt_leaves_the_map_as_it_was(
     assert [path.name for path in tmp_path.iterdir()] == ["town"]
 
 
+@pytest.fixture(params=[("rig", {"offset": -0.3}), ("rigs", [{"name": "mule"}])], ids=["one", "several"])
+def corrections(request: pytest.FixtureRequest) -> tuple[str, object]:
+    """Return the field of an earlier release with a correction for a rig, and that of this release."""
+    return request.param
+
+
 @pytest.fixture
-def town(small_map: Path, tmp_path: Path, calibration_json: Callable[..., dict[str, Any]]) -> Path:
-    """Return a map whose calibration has other features than this release computes, a site check and a correction for a rig."""
+def town(
+    small_map: Path,
+    tmp_path: Path,
+    calibration_json: Callable[..., dict[str, Any]],
+    corrections: tuple[str, object],
+) -> Path:
+    """Return a map whose calibration has other features than this release computes, a site check and corrections for rigs."""
     shutil.copytree(small_map, tmp_path / "town")
     old = calibration_json(site=SITE) | {
         "features": [{"name": "of_old", "mean": 0.0, "std": 1.0}],
-        "rig": {"offset": -0.3},
+        corrections[0]: corrections[1],
     }
     replace_calibration(tmp_path / "town", old)
     return tmp_path / "town"
@@ -140,13 +155,17 @@ def test_a_calibration_of_an_earlier_release_is_renewed_and_the_site_check_stays
     file.write_text(json.dumps(calibration_json(measured_on={"encoder_sha256": before.encoder_sha256})))
     assert run("calibrate", "--map", town, "--calibration", file) == 0
     said = capsys.readouterr().out
-    assert "removed: the correction for a rig" in said
+    assert "removed: the corrections for rigs" in said
     assert str(town) in said
     bundle = MapBundle.open(town)
     Localizer.open(bundle)
     assert bundle.manifest.version != before.version
     assert bundle.calibration is not None
-    assert (bundle.calibration.site, bundle.calibration.rig) == (Site.model_validate(SITE), None)
+    assert (bundle.calibration.site, bundle.calibration.rig, bundle.calibration.rigs) == (
+        Site.model_validate(SITE),
+        None,
+        (),
+    )
 
 
 def test_the_calibration_of_another_encoder_is_refused_and_the_map_stays(
