@@ -29,13 +29,6 @@ _OUTSIDE = (
     "this row alone. Out-of-map queries that are accepted by default: {then doubt.other_city.stereo.accepted_by_default} -> "
     "{now doubt.other_city.stereo.accepted_by_default} (stereo)"
 )
-_ASIDE = (
-    CONFIDENCE
-    + "Forced within 1 m: {{now prior.aside.{preset}.forced_within_1_m}}. Accepted and within 1 m without a prior: "
-    "{{now prior.none.{preset}.within_1_m}}. A prior that agrees with the answer a little lowers its confidence to the probability of "
-    "being in the map, which the model estimates lower. Without this, {gained} refused right answers would be accepted (28 November 2026)"
-)
-
 #: Reason by row id.
 WHY_FELL: dict[str, str] = {
     "real.kitti_stereo.registration.median_m": (
@@ -70,10 +63,6 @@ WHY_FELL: dict[str, str] = {
     "doubt.covariance_95_coverage.position.precise": _GAP,
     "doubt.expected_calibration_error": _OUTSIDE,
     "doubt.brier_score": _OUTSIDE,
-    **{
-        f"prior.aside.{preset}.within_1_m": _ASIDE.format(preset=preset, gained=gained)
-        for preset, gained in (("precise", "2 of 4"), ("stereo", "19 of 24"))
-    },
     **dict.fromkeys(
         (
             "doubt.sigma_coverage_gap",
