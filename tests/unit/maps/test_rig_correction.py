@@ -98,9 +98,9 @@ def test_an_answer_raised_above_the_odds_of_being_in_the_map_gains_from_a_prior(
     without, with_prior = (decide(calibration, evidence, 0.01, prior_nats=nats).confidence for nats in (0.0, 1.0))
     assert without == pytest.approx(float(probability(np.array(2.0))))
     assert with_prior == pytest.approx(float(probability(np.array(3.0))))
-    # Without a correction for a rig the decision is as before.
+    # Without a correction for a rig, log odds of 0 become 1.
     plain = calibration_of(right=flat | {"bias": 0.0}, known=flat | {"bias": -2.0})
-    assert decide(plain, evidence, 0.01, prior_nats=1.0).confidence == pytest.approx(float(probability(np.array(-1.0))))
+    assert decide(plain, evidence, 0.01, prior_nats=1.0).confidence == pytest.approx(float(probability(np.array(1.0))))
 
 
 KEY = {"width": 640, "height": 480, "fx": 320.0, "fy": 320.0, "cx": 319.5, "cy": 239.5}
