@@ -5,8 +5,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from service.client.tls import EncryptedKeyError, refuse_password
 from service.errors import KeysError
+from service.private_key import EncryptedKeyError, refuse_password
 from service.runtime.readable import why_unreadable
 
 if TYPE_CHECKING:

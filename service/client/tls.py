@@ -10,6 +10,7 @@ from typing import Self
 import httpx
 
 from service.errors import HandshakeError, KeysError, RequestError
+from service.private_key import EncryptedKeyError, refuse_password
 
 #: Environment variables that replace missing arguments. The service ignores names with the prefix STREETFIX_CLIENT_.
 CA, CERT, KEY = "STREETFIX_CLIENT_CA", "STREETFIX_CLIENT_CERT", "STREETFIX_CLIENT_KEY"
@@ -162,19 +163,6 @@ class ClientTls:
         """
         self.context()  # checks the files: gRPC would report a bad file as an unreachable service
         return tuple(None if each is None else each.read() for each in (self.ca, self.key, self.cert))  # type: ignore[return-value]
-
-
-class EncryptedKeyError(Exception):
-    """OpenSSL requested a password, because the private key is encrypted."""
-
-
-def refuse_password() -> str:
-    """Refuse to give a password. Without this callback OpenSSL would ask at the terminal.
-
-    Raises:
-        EncryptedKeyError: always.
-    """
-    raise EncryptedKeyError
 
 
 def _authorities(file: TlsFile) -> str:

@@ -19,11 +19,11 @@ def loaded_by(program: str) -> set[str]:
 def test_serving_loads_neither_torch_nor_model_training() -> None:
     program = (
         "import uvicorn, service.cli.main, service.cli.serve, service.cli.localize, service.cli.answer_text\n"
-        "import service.http.app, service.runtime.engine, service.runtime.settings, service.runtime.threads"
+        "import service.http.app, service.runtime.engine, service.runtime.settings, service.runtime.threads\n"
+        "import service.cli.certificates, service.grpc.server"
     )
-    assert (
-        loaded_by(program) & {"torch", "model_training", "embreex", "scipy", "shapely", "onnx", "matplotlib"} == set()
-    )
+    unwanted = {"torch", "model_training", "embreex", "scipy", "shapely", "onnx", "matplotlib", "httpx"}
+    assert loaded_by(program) & unwanted == set()
 
 
 def test_no_file_of_the_service_names_model_training() -> None:
