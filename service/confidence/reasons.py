@@ -51,7 +51,7 @@ GROUPS: tuple[tuple[str, tuple[str, ...], str], ...] = (
         "traffic in the map",
         ("through", "front", "upper_front", "mapped_inliers", "inliers", "upper_inliers", "shared_edges", "contrast", "unmapped",
          "likelihood"),
-        "build the map with the traffic vote, and look for changes since the survey",
+        "look for what was built or moved since the survey; a map that was built with --no-traffic-vote may show passing vehicles",
     ),
     (
         "calibration",

@@ -56,6 +56,13 @@ def test_every_feature_of_the_confidence_has_one_remedy():
     assert set(FEATURES) - set(UNWEIGHED) <= set(names)
 
 
+def test_no_remedy_is_what_build_map_does_anyway():
+    """The vote against traffic is the default. A remedy once advised it."""
+    (traffic,) = (remedy for check, _, remedy in GROUPS if check == "traffic in the map")
+    assert "--no-traffic-vote" in traffic
+    assert "with the traffic vote" not in traffic
+
+
 def test_pictures_that_hold_too_little_to_register_speak_of_depth(calibration):
     (reason,) = reasons_of(calibration, None)
     assert (reason.check, reason.evidence) == ("depth", ())
