@@ -80,7 +80,7 @@ def read_records(path: Path, dtype: np.dtype[Any]) -> NDArray[Any]:
     except (zstandard.ZstdError, MemoryError, OverflowError) as error:
         raise ValueError(f"not a valid zstd frame ({error})") from error
     if len(content) != size or size % dtype.itemsize:
-        raise ValueError(f"{size} bytes are no whole records of {dtype.itemsize} bytes")
+        raise ValueError(f"{size} bytes is not a multiple of the record size, {dtype.itemsize} bytes")
     planes = np.frombuffer(content, np.uint8).reshape(dtype.itemsize, size // dtype.itemsize)
     found: NDArray[Any] = np.ascontiguousarray(planes.T).view(dtype).reshape(planes.shape[1])
     return found

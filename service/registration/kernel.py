@@ -473,7 +473,7 @@ def packed_map(
     surfels = np.ascontiguousarray(surfels, SURFEL)
     for name in ("xyz", "normal", "thickness_m"):
         if not np.isfinite(surfels[name]).all():
-            raise StreetfixError(f"surfels: a number of {name} is not finite; leave out what the scans measured there")
+            raise StreetfixError(f"surfels: a number of {name} is not finite; remove the points that cause it")
     low, high = surfels["xyz"].min(axis=0).astype(np.float64), surfels["xyz"].max(axis=0).astype(np.float64)
     origin = low - reach_m - 2 * cell_m
     extent_m, most_m = float((high + reach_m - origin).max()), (1 << KEY_BITS) * REGION * BLOCK * cell_m

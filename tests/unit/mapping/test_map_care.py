@@ -119,7 +119,7 @@ def test_a_manifest_of_another_format_is_named(own):
         ),
         (
             lambda _: {"statistics": Columns.of(np.zeros(3))},
-            r"voxels\.zst: .*24 bytes are no whole records of 60 bytes",
+            r"voxels\.zst: .*24 bytes is not a multiple of the record size, 60 bytes",
         ),
         (lambda _: {"statistics": Columns.of(np.zeros(3, VOXEL))}, r"voxels\.zst: a voxel has no points"),
     ],

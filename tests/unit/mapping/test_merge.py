@@ -186,7 +186,9 @@ def test_a_name_that_is_taken_is_refused_before_any_work(half_maps, tmp_path):
 
 def test_sums_of_another_kind_are_refused(half_maps, tmp_path, monkeypatch):
     monkeypatch.setattr(stored_map, "VOXEL", np.dtype([("cell", "<i4", (3,)), ("other", "u1", (1000,))]))
-    with pytest.raises(BundleError, match=r"voxels\.zst: not a valid file of voxels .*no whole records of 1012 bytes"):
+    with pytest.raises(
+        BundleError, match=r"voxels\.zst: not a valid file of voxels .*not a multiple of the record size, 1012 bytes"
+    ):
         voxels_of(MapBundle.open(half_maps[0]))
 
 
