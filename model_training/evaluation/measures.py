@@ -56,7 +56,7 @@ def measure(predictions: Predictions, street_names: list[str]) -> dict[str, Any]
     shown = np.where(answered, distance, np.inf)
     shares: dict[str, NDArray[np.bool_]] = {
         "within_0_5_m": shown <= 0.5,
-        "within_1_m": shown <= 1.0,
+        "within_1_m": shown <= RIGHT_M,
         "within_5_m": shown <= RIGHT_PLACE_M,
         "recall_at_1_5m": recall_at(p.ranked_xy, true_xy, 1),
         "recall_at_5_5m": recall_at(p.ranked_xy, true_xy, 5),

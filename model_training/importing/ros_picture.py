@@ -8,7 +8,7 @@ from jaxtyping import UInt8
 from numpy.typing import NDArray
 
 from model_training.importing.recording import Depth
-from service.bridge.pictures import LENSES
+from service.bridge.pictures import DEPTHS, LENSES
 from service.errors import StreetfixError
 from service.geometry.camera import PinholeCamera
 from service.geometry.distortion import COEFFICIENTS
@@ -25,7 +25,6 @@ _COLOUR = {
     "8UC1": (1, (0, 0, 0)),
     "8UC3": (3, (2, 1, 0)),
 }
-_DEPTH = {"16UC1": "u2", "mono16": "u2", "32FC1": "f4"}
 _LIMITS = ImageLimits()
 
 
@@ -64,9 +63,9 @@ def depth_of(message: Any) -> Depth | str:
         except StreetfixError as error:
             return f"cannot be decoded: {error.message}"
         return _as_depth(values)
-    if message.encoding not in _DEPTH:
-        return f"unknown encoding {message.encoding[:40]!r} (known: {', '.join(_DEPTH)})"
-    pixels = _pixels(message, _DEPTH[message.encoding], 1)
+    if message.encoding not in DEPTHS:
+        return f"unknown encoding {message.encoding[:40]!r} (known: {', '.join(DEPTHS)})"
+    pixels = _pixels(message, DEPTHS[message.encoding], 1)
     if isinstance(pixels, str):
         return pixels
     return _as_depth(np.ascontiguousarray(pixels[:, :, 0]))

@@ -17,10 +17,12 @@ from pydantic import BaseModel, ConfigDict
 from torch import Tensor, nn
 from torch.nn import functional
 
-from service.imaging.view_grid import PLANES
+from service.imaging.view_grid import PLANES, ViewGrid
 
 #: Layers with learned weights.
 LAYERS = 12
+#: Ranges of a view, metres.
+_NEAREST_M, _FARTHEST_M = ViewGrid().min_range_m, ViewGrid().max_range_m
 #: Input channels: log range, measured, height, observed, V1, V2, brightness.
 CHANNELS = 7
 
@@ -119,7 +121,7 @@ def normalised(planes: Tensor) -> Tensor:
     measured = (distance > 0).to(planes.dtype)
     return torch.cat(
         [
-            torch.log(distance.clamp(0.5, 40.0) / 10.0) * measured,
+            torch.log(distance.clamp(_NEAREST_M, _FARTHEST_M) / 10.0) * measured,
             measured,
             (height.clamp(-4.0, 14.0) / 4.0 - 0.4) * measured,
             observed,

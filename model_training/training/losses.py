@@ -79,12 +79,12 @@ def _both_ways(forward: Tensor, backward: Tensor, one_way: Callable[[Tensor, Ten
     return 0.5 * (one_way(forward, own) + one_way(backward, own)), forward.argmax(dim=1) == own
 
 
-def _logits(asked: Side, answers: Side, scale: Tensor, more: Side | None) -> Tensor:
+def _logits(one: Side, other: Side, scale: Tensor, more: Side | None) -> Tensor:
     """Scaled similarities (B, B + N) of one side to the other side and to further negatives."""
-    near = torch.cdist(asked.xy, answers.xy) < SAME_PLACE_M
+    near = torch.cdist(one.xy, other.xy) < SAME_PLACE_M
     near.fill_diagonal_(False)
-    similarity = asked.descriptors @ answers.descriptors.T
+    similarity = one.descriptors @ other.descriptors.T
     if more is not None:
-        near = torch.cat([near, torch.cdist(asked.xy, more.xy) < SAME_PLACE_M], dim=1)
-        similarity = torch.cat([similarity, asked.descriptors @ more.descriptors.T], dim=1)
+        near = torch.cat([near, torch.cdist(one.xy, more.xy) < SAME_PLACE_M], dim=1)
+        similarity = torch.cat([similarity, one.descriptors @ more.descriptors.T], dim=1)
     return (similarity * scale).masked_fill(near, -1e4)

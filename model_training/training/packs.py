@@ -241,9 +241,9 @@ def _matched_queries(
             roll, pitch = np.deg2rad(rng.normal(0, 0.6, 2))
             R = upright_on(city, x, y, heading) @ rotation_y(pitch) @ rotation_x(roll)
             T = transform_from(R, np.array([x, y, city.height(x, y) + rng.uniform(*rig.height_m)]))
-            met = scene.distances(T[:3, 3], (_COARSE @ R.T).astype(np.float32))
-            met = met[met > 0]
-            if len(met) and np.percentile(met, 40) > 1.5:
+            distances_m = scene.distances(T[:3, 3], (_COARSE @ R.T).astype(np.float32))
+            distances_m = distances_m[distances_m > 0]
+            if len(distances_m) and np.percentile(distances_m, 40) > 1.5:
                 break
         view = drive.view(T, grid)
         ranges[row], rgb[row], seen[row] = view.ranges, view.rgb, view.seen

@@ -22,7 +22,7 @@ _COLOURS: dict[str, tuple[int, int | None]] = {
     "mono8": (1, cv2.COLOR_GRAY2RGB),
 }
 #: Depth encodings of REP 118: unsigned millimetres or floating-point metres. Some drivers call the former mono16.
-_DEPTHS = {"16UC1": "u2", "mono16": "u2", "32FC1": "f4"}
+DEPTHS = {"16UC1": "u2", "mono16": "u2", "32FC1": "f4"}
 #: Our model for each ``distortion_model`` of a CameraInfo (REP 104 and drivers). Both give OpenCV's coefficients.
 LENSES: dict[str, DistortionModel] = {
     "": "brown_conrady",
@@ -105,9 +105,9 @@ def depth_from(message: ImageLike, topic: str) -> NDArray[np.float32]:
     Raises:
         RequestError: as for ``rgb_from``.
     """
-    known = _DEPTHS.get(message.encoding)
+    known = DEPTHS.get(message.encoding)
     if known is None:
-        raise _unread(message, topic, _DEPTHS)
+        raise _unread(message, topic, DEPTHS)
     dtype = np.dtype(known).newbyteorder(">" if message.is_bigendian else "<")
     values = _rows(message, topic, dtype, 1)[..., 0].astype(np.float32)
     return values if known == "f4" else values * np.float32(0.001)

@@ -105,11 +105,11 @@ def run_variant(
     plan = PLANS[name]
     trainer = CnnTrainer(plan, frames, pairs if plan.pairs_too else None, work / name, budget_s=budget_s)
     net = trainer.run(f"CNN {name}", report)
-    told = trainer.training
+    training = trainer.training
     cost, images, why = (
-        told.processor_s,
-        told.images,
-        f"{trainer.iterations} iterations" if plan.as_paper else told.ended or "",
+        training.processor_s,
+        training.images,
+        f"{trainer.iterations} iterations" if plan.as_paper else training.ended or "",
     )
     split, pictures = trainer.split, trainer.pictures
     gallery = _gallery(net, pictures, split, pairs if plan.pairs_too else None)
@@ -149,7 +149,7 @@ def run_variant(
     for which, test in tests.items():
         rgbd(which, test, np.arange(len(test)))
         rgbd(f"depth.{which}", test, np.arange(len(test)), colour=False)
-    return Variant(name, answers_by_set, cost, images, told.curve, why)
+    return Variant(name, answers_by_set, cost, images, training.curve, why)
 
 
 def _gallery(net: PaperCnn, pictures: LidarPictures, split: Split, pairs: Pairs | None) -> Gallery:
