@@ -48,8 +48,8 @@ def command(
     out: Annotated[
         Path | None,
         typer.Option(
-            help="Calibration file to write, JSON.  [default: beside the stock encoder]  With --map it is for `build-map "
-            "--calibration`. Without it, --map writes the correction into the map."
+            help="Calibration file to write, JSON.  [default: beside the stock encoder]  With --map, --out writes a file for `build-map "
+            "--calibration`. With --map and without --out, the command changes the map."
         ),
     ] = None,
     work: Annotated[
@@ -113,8 +113,8 @@ def command(
 ) -> None:
     """Fit the confidence of an encoder on calibration cities, or correct or renew the confidence of a map.
 
-    The first simulates the cities, which takes about two hours. A correction takes seconds to minutes, a renewal a second. A correction
-    holds for queries of its rig. It replaces that of the same rig, and those of other rigs stay.
+    Without --map: the command simulates the cities, about two hours. With --drive or --rig: seconds to minutes. With --calibration: a
+    second. A correction holds for queries of its rig. It replaces an earlier correction of the same rig. Corrections of other rigs stay.
 
     \b
     Examples:

@@ -62,8 +62,8 @@ def command(
     on_track: Annotated[
         int,
         typer.Option(
-            help="Additional queries at the survey's own poses and among its vehicles. This is the paper's split. It "
-            "leaks.",
+            help="Additional queries at the survey's own poses and among its vehicles. This is the paper's split. "
+            "Queries and survey overlap (data leakage), so the figures are too good.",
             min=0,
         ),
     ] = 0,

@@ -60,15 +60,16 @@ def command(
         str,
         typer.Option(
             help="batch: the batch's own pairs. look-alikes: half of a batch of 128 is hard negatives. memory: also "
-            "descriptors of earlier batches. Such descriptors undo a training on a single city."
+            "descriptors of earlier batches. They spoil training on a single city."
         ),
     ] = "look-alikes",
     device: Annotated[str, typer.Option(help="Device: auto, cpu or cuda.")] = "auto",
     shards: Annotated[
         int | None,
         typer.Option(
-            help="Parts of a batch with random numbers of their own. At most so many processes can share the batch, and any "
-            "number of them learns the same.  [default: that of the run, or the number of processes]",
+            help="Parts of a batch with random numbers of their own. This is also the largest number of training "
+            "processes. Their number does not change the result, except for rounding.  [default: that of the run, or the number of "
+            "processes]",
             min=1,
         ),
     ] = None,

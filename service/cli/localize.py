@@ -23,7 +23,7 @@ def command(
         Path | None, typer.Option(help=f"Colour image: JPEG, PNG or WebP. {_EITHER}", show_default=False)
     ] = None,
     depth: Annotated[
-        Path | None, typer.Option(help=f"Depth image: 16-bit PNG, TIFF, NPY or SFD1. {_EITHER}", show_default=False)
+        Path | None, typer.Option(help=f"Depth image: 16-bit PNG, TIFF, NPY or raw16. {_EITHER}", show_default=False)
     ] = None,
     camera: Annotated[
         Path | None,

@@ -90,7 +90,7 @@ def command(
     false_accept_rate: Annotated[
         float | None,
         typer.Option(
-            help="Largest share of the calibration's out-of-map queries with status LOCALIZED. A higher rate than the default also accepts "
+            help="Largest share of the out-of-map calibration queries that may be LOCALIZED. A higher rate than the default also accepts "
             "a confidence below 0.9.  [default: 0.01]"
         ),
     ] = None,

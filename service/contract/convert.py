@@ -136,7 +136,8 @@ def odometry_std_of(std: schema.OdometryStd | None, field: str, *, known: bool) 
         return None
     if not known:
         raise RequestError(
-            f"{field}: there is no odometry that it could describe; send the odometry, or omit it", field=field
+            f"{field}: the request has no odometry (T_previous_camera, in gRPC previous_from_camera); send it, or omit odometry_std",
+            field=field,
         )
     return OdometryStd(std.position_m, float(np.deg2rad(std.angle_deg)))
 

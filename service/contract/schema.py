@@ -215,7 +215,7 @@ class Depth(_Strict):
     )
     encoding: Literal["auto", "carla", "compressed_depth"] = Field(
         "auto",
-        description="auto: the first bytes of the file tell. carla: depth in the 24 bits of a colour PNG. "
+        description="auto: the service detects the encoding from the first bytes. carla: depth in the 24 bits of a colour PNG. "
         "compressed_depth: data of a ROS compressedDepth message, PNG or RVL",
     )
     max_range_m: float | None = Field(
@@ -277,8 +277,8 @@ class Options(_Strict):
         None,
         ge=LEAST_FALSE_ACCEPT_RATE,
         lt=1,
-        description="tolerated share of out-of-map queries with status LOCALIZED. The service refuses a share below the least "
-        "that the map's calibration measured, or below the least that the recording of this rig supports. Default: the service's setting",
+        description="tolerated share of out-of-map queries with status LOCALIZED. The service refuses a rate below the lowest "
+        "rate that the map's calibration supports, or that the recording of this rig supports. Default: the service's setting",
     )
 
 
@@ -569,7 +569,7 @@ class Reason(BaseModel):
 
 
 class CameraHeight(BaseModel):
-    """Height of the camera above the ground that the answer rests on."""
+    """Height of the camera above the ground that the service used."""
 
     height_m: float = Field(description="height of the camera's centre above the ground, metres")
     origin: Literal["given", "estimated", "assumed"] = Field(

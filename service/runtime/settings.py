@@ -172,7 +172,7 @@ class Settings(BaseSettings):
         None, description="OpenTelemetry collector, as http://127.0.0.1:4318/v1/traces; needs the extra otel"
     )
     traces_share: float = Field(
-        0.05, ge=0, le=1, description="traced share of the requests that bring no trace of their own"
+        0.05, ge=0, le=1, description="share of requests without a trace context that the service traces"
     )
     grpc_streams: int = Field(32, ge=0, le=1000, description="gRPC streams that may be open at once")
     grpc_idle_s: float = Field(
@@ -208,7 +208,7 @@ class Settings(BaseSettings):
         FALSE_ACCEPT_RATE,
         ge=LEAST_FALSE_ACCEPT_RATE,
         lt=1,
-        description="largest share of the calibration's out-of-map queries with status LOCALIZED. A higher rate than the default also "
+        description="largest share of the out-of-map calibration queries that may be LOCALIZED. A higher rate than the default also "
         "accepts a confidence below 0.9",
     )
     belief_key: SecretStr | None = Field(

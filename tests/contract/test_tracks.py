@@ -173,7 +173,8 @@ def test_deviations_without_odometry_are_refused(faces: Any, parts_of: Parts) ->
     client, stub, _ = faces
     refused = posted(client, parts_of(track={"odometry_std": ROUGH}))
     assert (refused.status_code, refused.json()["field"]) == (422, "track.odometry_std")
-    assert "send the odometry" in refused.json()["detail"]
+    assert "the request has no odometry (T_previous_camera" in refused.json()["detail"]
+    assert refused.json()["detail"].endswith("send it, or omit odometry_std")
     parts = parts_of()
     frame = pb.LocalizeRequest(rgb=parts["rgb"], depth=parts["depth"], camera=CAMERA, depth_format=DEPTH)
     (problem,) = stub.LocalizeStream(

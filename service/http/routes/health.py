@@ -21,14 +21,14 @@ def router_for(engine: Engine, version: str) -> APIRouter:
     """
     router = APIRouter(tags=["operation"])
 
-    @router.get("/livez", operation_id="getLiveness", summary="Tell whether the process lives")
+    @router.get("/livez", operation_id="getLiveness", summary="Report whether the process is alive")
     async def livez() -> schema.Health:
         return schema.Health()
 
     @router.get(
         "/readyz",
         operation_id="getReadiness",
-        summary="Tell whether the service has a map to answer from",
+        summary="Report whether the service has a map to answer from",
         responses=problems(503),
     )
     async def readyz() -> schema.Readiness:

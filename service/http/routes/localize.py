@@ -56,7 +56,7 @@ def router_for(runner: RequestRunner) -> APIRouter:
     async def localize_sequence(request: Request) -> Response:
         """Return the pose of the first frame.
 
-        The other frames decide what the first frame leaves open, for example in a street of repeating blocks.
+        The other frames resolve the ambiguity of the first frame, for example in a street of repeating blocks.
         Every other frame has `T_reference_camera`: odometry, or the pose of the camera on the rig.
         """
         return await ask(request, _sequence)
