@@ -94,6 +94,26 @@ def test_an_answer_that_is_refused_says_what_to_check(url: str, page_of: Pages, 
     page.unroute_all()
 
 
+def test_an_answer_names_the_correction_of_its_rig(url: str, page_of: Pages) -> None:
+    """The map of the demo has no correction. The name is put into the service's own answer, then taken away again."""
+    page = page_of()
+    open_console(page, url)
+    row = page.locator("section:has(h2:text('Pose')) dl.facts div:has(dt:text-is('confidence corrected for'))")
+    click_sample(page, "01")
+    assert row.count() == 0
+
+    def corrected(route: Any) -> None:
+        response = route.fetch()
+        content = response.json()
+        content["answer"]["rig_correction"] = "<b>mule</b>"
+        route.fulfill(response=response, json=content)
+
+    page.route("**/v1/explain", corrected)
+    click_sample(page, "02")
+    assert row.locator("dd").inner_text() == "<b>mule</b>"  # text, not markup
+    page.unroute_all()
+
+
 def test_a_wrong_file_is_told_with_what_to_do(url: str, demo_map: Demo, page_of: Pages, shoot: Shoot) -> None:
     page = page_of()
     open_console(page, url)

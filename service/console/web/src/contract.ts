@@ -80,6 +80,8 @@ export interface Answer {
   extrapolated: Record<string, number>;
   /** Least confidence of a LOCALIZED answer, and an upper bound of the share of out-of-map queries that reach it. */
   threshold: { confidence: number; false_accept_rate: number } | null;
+  /** Name of the correction for a rig that the confidence has. */
+  rig_correction: string | null;
   map: MapVersion;
   timings_ms: { decode: number; fuse: number; encode: number; search: number; register: number; total: number };
 }

@@ -5,6 +5,7 @@ import { ellipseOf } from '../map/ellipse';
 import { degrees, metres, milliseconds, percent } from '../numbers';
 import { ServiceError } from '../service';
 import { errorOf } from '../query/truth';
+import { calibrationRows } from './calibration_rows';
 import { IntermediateImages } from './intermediate_images';
 
 const STATUS_TEXT = {
@@ -117,7 +118,7 @@ export class AnswerPanel {
       rows.push(['σ heading', degrees(answer.spread.heading_std_deg)]);
       rows.push(['weight of hypotheses', percent(answer.spread.hypotheses_weight)]);
     }
-    rows.push(...thresholdRow(answer), ...extrapolatedRow(answer), ...heightRow(answer));
+    rows.push(...calibrationRows(answer), ...heightRow(answer));
     rows.push(['map', `${answer.map.name} ${answer.map.version.slice(0, 8)}`]);
     return element('section', {}, element('h2', {}, 'Possible positions'), facts(rows));
   }
@@ -133,7 +134,7 @@ export class AnswerPanel {
       rows.push(['σ on the ground', `${metres(ellipse.major)} × ${metres(ellipse.minor)}`]);
       rows.push(['σ heading', degrees((180 / Math.PI) * Math.sqrt(covariance[35] ?? 0))]);
     }
-    rows.push(...thresholdRow(answer), ...extrapolatedRow(answer), ...heightRow(answer));
+    rows.push(...calibrationRows(answer), ...heightRow(answer));
     rows.push(['map', `${answer.map.name} ${answer.map.version.slice(0, 8)}`]);
     return element('section', {}, element('h2', {}, 'Pose'), facts(rows));
   }
@@ -192,19 +193,6 @@ export class AnswerPanel {
       element('p', { class: 'hint' }, `${milliseconds(times.total)} in the service, ${milliseconds(elapsedMs)} from sending to the answer`),
     );
   }
-}
-
-/** Features outside the range of the calibration data: there the confidence may be wrong. */
-function extrapolatedRow({ extrapolated }: Answer): [string, string][] {
-  const features = Object.entries(extrapolated).map(([name, size]) => `${name} ${size > 0 ? '+' : '−'}${Math.abs(size).toFixed(1)} σ`);
-  return features.length === 0 ? [] : [['confidence is extrapolated', features.join(', ')]];
-}
-
-/** The same words as in docs/confidence.md and `serve --help`. */
-function thresholdRow({ threshold }: Answer): [string, string][] {
-  if (threshold === null) return [];
-  const share = `${Number((100 * threshold.false_accept_rate).toPrecision(2))} %`;
-  return [['LOCALIZED from', `confidence ${threshold.confidence.toFixed(2)}; at most ${share} of out-of-map queries reach it`]];
 }
 
 function heightRow({ camera_height }: Answer): [string, string][] {
