@@ -1,7 +1,7 @@
 """Turn a query of the simulated camera into that of another rig: a smaller field of view, or depth from a spinning LiDAR.
 
-A camera that covers less of the view grid has other confidence features at the same place. A calibration with a single field of view takes
-queries of every other one for out-of-map queries (decision 0126). Most families are simulated directly (``families.FAMILIES``).
+A camera that covers less of the view grid has other confidence features at the same place. A calibration with a single field of view
+classifies queries with another field of view as out-of-map (decision 0126). Most families are simulated directly (``families.FAMILIES``).
 """
 
 from dataclasses import dataclass, replace

@@ -314,8 +314,8 @@ class Vote:
     def removed(self, votes: Iterable[Arrays], earlier: NDArray[np.int64] | None = None) -> NDArray[np.int64]:
         """Count the votes; return the keys of the voxels that they remove, ascending (m,).
 
-        A voxel is removed if more passes see through it than hit it, at least two. With ``each_scan`` it is removed if at least as
-        many scans see through it as hit it.
+        A voxel is removed if at least two passes see through it, and more passes than hit it. With ``each_scan`` it is removed if the
+        scans that see through it are not fewer than those that hit it.
 
         Args:
             votes: the votes of all scans, as ``votes`` returns them.

@@ -3,6 +3,8 @@
 Each voxel stores the moments of its points: count, sum, sum of products, in single precision as in a bundle. So the memory depends on the
 number of voxels, not of points: 56 bytes each, and half as much again while scans are added.
 The normal of a voxel is the axis of least variance of its moments and those of its 26 neighbours. The neighbours have less weight.
+
+Speed: the C code takes a quarter of the time of NumPy for the moments, and a sixth for the surfels (27 November 2026, decision 0166).
 """
 
 import ctypes

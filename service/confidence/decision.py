@@ -257,8 +257,8 @@ def extrapolated(
     """Return the features that the confidence uses and that lie outside the range of the calibration data.
 
     The confidence does not follow a feature beyond the first and the last knot of its term. The range is wider by ``MARGIN`` of the
-    distance between the knots, because a few of the calibration's own queries lie just outside. A feature with an ideal, such as no
-    distance to the nearest place, has no end on that side: the answer gets no more credit there than the best calibration data.
+    distance between the knots, because a few of the calibration's own queries lie just outside. Some features have an
+    ideal value, for example 0 m. On that side the range has no limit: the answer gets no more credit than the best calibration data.
 
     Args:
         calibration: calibration of the map.

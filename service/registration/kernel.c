@@ -242,8 +242,8 @@ static inline void find_cells(const Grid *g, double at[3][BATCH_SIZE], int64_t c
     for (int64_t k = 0; k < count; k++) rows[k] = cells[k] < 0 ? -1 : row_of(g, regions[k], cells[k]);
 }
 
-/* Unpacks the surfels of a batch. A surfel of another region is less than half a region away, so the nearest of the positions that have
- * its steps is meant. */
+/* Unpacks the surfels of a batch. The steps give the position modulo one region. A surfel of another region is less than half a region
+ * away, so the candidate nearest to this region is the right one. */
 static inline void unpack(Batch *b, double cell)
 {
     static const PackedSurfel none = {{0, 0, 0}, {0, 0}, 0, 0}; /* faces up */

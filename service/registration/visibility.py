@@ -2,6 +2,8 @@
 
 One request casts rays from several poses that are metres apart. A camera sees a tenth of the regions around these poses. So the
 surfels that are visible from anywhere near a pose are collected once and reused.
+
+Speed: the C code takes a twenty-fifth of the time of NumPy to cast the rays (26 November 2026, decision 0148).
 """
 
 import ctypes
