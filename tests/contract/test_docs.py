@@ -176,9 +176,10 @@ def test_how_it_works_tells_the_numbers_that_are_set() -> None:
     structure = support.structure
     words = {5: "five", 6: "six", 8: "eight", 10: "ten", 11: "eleven"}
     for text in (
-        f"Up to {StartSettings().most} hypotheses with {words[len(registration.offsets_m)]} starts each",
-        f"a coarse stage of {registration.coarse_points} points",
-        f"a middle one of {registration.middle_points}, the {words[registration.refined]} most promising",
+        f"Up to {StartSettings().most} hypotheses have {words[len(registration.offsets_m)]} starts each",
+        f"A coarse stage registers {registration.coarse_points} points",
+        f"A middle stage registers {registration.middle_points} points",
+        f"The fine stage takes the {words[registration.refined]} most promising",
         f"thinned to {PointSettings().points:,} points",
         f"{support.inliers:g} inliers + {support.similarity:g} similarity + {support.likelihood:g} log likelihood",
         f"{structure.shared_edges:g} shared edges + {structure.upper_inliers:g} upper inliers + {structure.contrast:g} contrast",
