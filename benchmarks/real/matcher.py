@@ -4,9 +4,11 @@ The simulated pairs are from validation cities, not from calibration, training o
 passes the same vehicles on the same path.
 """
 
+from dataclasses import fields
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from benchmarks.real.streets import QUERIES, imported
 from benchmarks.report import Report
@@ -64,7 +66,9 @@ def simulated_errors(work: Path) -> DisparityErrors:
 
 
 def matcher_rows(report: Report, data: Path, work: Path, recording: str = "kitti_0005") -> None:
-    """Add the error sizes of a recording and of the simulated pairs, and their ratios.
+    """Add the error statistics of a recording and of the simulated pairs, and the ratios of their error sizes.
+
+    The statistics are error size and share of unmatched points by texture, outlier share by texture and distance, and correlation length.
 
     Args:
         report: receives the rows.
@@ -77,7 +81,7 @@ def matcher_rows(report: Report, data: Path, work: Path, recording: str = "kitti
         report.row("real.matcher.error_ratio", None, "ratio", bar=RATIO, why=f"no recordings at {data.name}")
         return
     recorded, simulated = disparity_errors(dataset, QUERIES), simulated_errors(work)
-    ratios: list[float] = []
+    both, ratios = (("", recorded), (".simulated", simulated)), list[float]()
     for textured, kind in ((True, "textured"), (False, "untextured")):
         real, ours = recorded.sizes(textured=textured), simulated.sizes(textured=textured)
         for name, measure in (("median", np.median), ("percentile_90", lambda sizes: np.percentile(sizes, 90))):
@@ -86,14 +90,35 @@ def matcher_rows(report: Report, data: Path, work: Path, recording: str = "kitti
             report.row(f"{row}_px.simulated", float(measure(ours)), "px", n=len(ours))
             ratios.append(float(measure(ours) / measure(real)))
             report.row(f"real.matcher.error_ratio.{kind}.{name}", ratios[-1], "ratio", bar=RATIO)
-        report.row(f"real.matcher.{kind}.unmatched", recorded.unmatched(textured=textured), "share")
-        report.row(f"real.matcher.{kind}.unmatched.simulated", simulated.unmatched(textured=textured), "share")
+        for name, errors in both:
+            points, row = int((errors.textured == textured).sum()), f"real.matcher.{kind}"
+            report.row(f"{row}.unmatched{name}", errors.unmatched(textured=textured), "share", n=points)
+            _outlier_rows(report, row, name, of_points(errors, errors.textured == textured))
     worst = max(ratios, key=lambda ratio: abs(np.log(ratio)))
     report.row(
         "real.matcher.error_ratio", worst, "ratio", bar=RATIO, why="the ratio of the four that is farthest from 1"
     )
-    for name, errors in (("", recorded), (".simulated", simulated)):
-        report.row(f"real.matcher.correlation_length{name}", errors.correlation_length_px(), "px")
-        for nearest_m, farthest_m in RANGES_M:
-            share = errors.outliers(nearest_m=nearest_m, farthest_m=farthest_m)
-            report.row(f"real.matcher.outliers_{nearest_m}_to_{farthest_m}_m{name}", share, "share")
+    for name, errors in both:
+        matched = int(np.isfinite(errors.error_px).sum())
+        report.row(f"real.matcher.correlation_length{name}", errors.correlation_length_px(), "px", n=matched)
+        _outlier_rows(report, "real.matcher", name, errors)
+
+
+def of_points(errors: DisparityErrors, kept: NDArray[np.bool_]) -> DisparityErrors:
+    """Return the errors of some of the points.
+
+    Args:
+        errors: errors of n points.
+        kept: True for each point to keep (n,).
+    """
+    return DisparityErrors(*(getattr(errors, field.name)[kept] for field in fields(DisparityErrors)))
+
+
+def _outlier_rows(report: Report, row: str, name: str, errors: DisparityErrors) -> None:
+    """Add the outlier share at each distance. The number of samples is that of the matched points."""
+    for nearest_m, farthest_m in RANGES_M:
+        inside = (errors.z_m >= nearest_m) & (errors.z_m < farthest_m)
+        matched = int(np.isfinite(errors.error_px[inside]).sum())
+        share = errors.outliers(nearest_m=nearest_m, farthest_m=farthest_m) if matched else None
+        why = None if matched else "no matched point at this distance"
+        report.row(f"{row}.outliers_{nearest_m}_to_{farthest_m}_m{name}", share, "share", n=matched, why=why)
