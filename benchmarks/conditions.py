@@ -3,7 +3,7 @@
 from collections.abc import Iterator
 from typing import Any
 
-from benchmarks.plans import SEQUENCE, hard_plan, lidar_16_plan, unseen_plan
+from benchmarks.plans import SEQUENCE, SPARSE_M, hard_plan, lidar_16_plan, lidar_os0_plan, unseen_plan
 from benchmarks.report import Report
 from benchmarks.runs import Runs, accepted_within, share, within
 from model_training.datasets.dataset import Dataset
@@ -31,12 +31,15 @@ def asked_of(runs: Runs) -> Iterator[Asked]:
         yield name, bundle, dataset, f"{name}_precise"
     yield (
         "survey_5m",
-        runs.bundle(dataset, BuildSettings(name="hard-survey-5m", spacing_m=5.0)),
+        runs.bundle(dataset, BuildSettings(name="hard-survey-5m", spacing_m=SPARSE_M)),
         dataset,
         "clear_precise",
     )
     beams = runs.dataset(lidar_16_plan())
     yield "lidar_16", runs.bundle(beams), beams, "clear_precise"
+    tall = runs.dataset(lidar_os0_plan())
+    bundle = runs.bundle(tall, BuildSettings(name=tall.name, spacing_m=SPARSE_M))
+    yield "lidar_os0_5m", bundle, dataset, "clear_precise"
 
 
 def condition_rows(report: Report, runs: Runs) -> None:

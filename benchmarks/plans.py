@@ -7,6 +7,8 @@ from model_training.training.recipe import EVALUATION_SEEDS
 BOTH = ("precise", "stereo")
 HARD_COUNT, SEQUENCES, SEQUENCE = 500, 300, 5
 LARGE_M = (600.0, 400.0)
+#: Distance between the scans of the conditions with a sparse survey, metres.
+SPARSE_M = 5.0
 #: Heights of the camera, metres; queries of each (with each depth camera), and extent of their city.
 HEIGHTS_M, HEIGHT_COUNT, HEIGHT_CITY_M = (0.2, 0.4, 0.8, 1.5, 2.5, 3.5), 100, (300.0, 200.0)
 #: Height of the camera on unusual ground, metres; slope of the ramp, and pitch of a camera that looks down steeply, degrees.
@@ -103,6 +105,16 @@ def lidar_16_plan() -> SimulationPlan:
     """Plan the same city and clear day, with a survey of 16 beams."""
     queries = (QueryPlan(name="clear", traversal=10, count=HARD_COUNT),)
     return SimulationPlan(name="hard-lidar-16", seed=EVALUATION_SEEDS[1], lidar="vlp_16", queries=queries)
+
+
+def lidar_os0_plan() -> SimulationPlan:
+    """Plan a survey of the same city by an Ouster OS0 with 128 beams over 90 degrees. The queries are those of ``hard_plan``.
+
+    A scan every 5 m, as in ``survey_5m``: the two differ by the LiDAR only, and a scan every metre would take over 4 GB.
+    """
+    return SimulationPlan(
+        name="hard-lidar-os0", seed=EVALUATION_SEEDS[1], lidar="os0_128", spacing_m=SPARSE_M, queries=()
+    )
 
 
 def repeating_plan() -> SimulationPlan:

@@ -98,16 +98,25 @@ class Runs:
             settings: settings of the map; None takes the defaults.
         """
         settings = settings or BuildSettings(name=dataset.name)
-        made_of = (
-            f"{dataset.folder.name.rsplit('-', 1)[-1]}-{Encoder.open(self.encoder).sha256[:12]}-{code_hash(*MAPPING)}"
-            f"-{_calibration_hash()}"
-        )
-        folder = self.work / "maps" / f"{settings.name}-{made_of}"
+        folder = self.map_folder(settings.name, dataset)
         if not folder.exists():
             folder.parent.mkdir(parents=True, exist_ok=True)
             with bars() as report:
                 build_map(dataset, self.encoder, folder, settings, report=report)
         return MapBundle.open(folder)
+
+    def map_folder(self, name: str, dataset: Dataset) -> Path:
+        """Return the folder of a map. Its name contains the encoder and the hashes of the code and of the stock calibration.
+
+        Args:
+            name: first part of the folder's name.
+            dataset: dataset of the map. The name of its folder ends with the hash of the code that made it.
+        """
+        made_of = (
+            f"{dataset.folder.name.rsplit('-', 1)[-1]}-{Encoder.open(self.encoder).sha256[:12]}-{code_hash(*MAPPING)}"
+            f"-{_calibration_hash()}"
+        )
+        return self.work / "maps" / f"{name}-{made_of}"
 
     def figures(self, bundle: MapBundle, dataset: Dataset, names: list[str], *, refine: bool = False) -> dict[str, Any]:
         """Evaluate query sets by retrieval alone or with registration; the result also holds the answers.
@@ -183,7 +192,8 @@ class Runs:
             name: name of the query set.
         """
         code = code_hash(*MAPPING, "model_training/evaluation/raw_range.py")
-        kept = self.work / "raw" / f"{dataset.folder.name}-{code}-{name}-every{RAW_EVERY}.json"
+        # Conditions of the survey share their queries, and only their maps differ.
+        kept = self.work / "raw" / bundle.path.name / f"{dataset.folder.name}-{code}-{name}-every{RAW_EVERY}.json"
         if not kept.exists():
             kept.parent.mkdir(parents=True, exist_ok=True)
             with bars() as report:

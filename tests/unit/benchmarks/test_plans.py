@@ -1,3 +1,4 @@
+import numpy as np
 import pytest
 
 pytest.importorskip("torch", reason="needs the extra `training`")
@@ -5,10 +6,12 @@ pytest.importorskip("torch", reason="needs the extra `training`")
 from benchmarks.plans import (  # after the skip
     HEIGHTS_M,
     SEQUENCE,
+    SPARSE_M,
     hard_plan,
     height_plan,
     large_plan,
     lidar_16_plan,
+    lidar_os0_plan,
     more_plan,
     paper_plan,
     repeating_plan,
@@ -17,6 +20,7 @@ from benchmarks.plans import (  # after the skip
 from benchmarks.runs import pooled
 from model_training.simulation.drives import driven
 from model_training.simulation.hard import HARD
+from model_training.simulation.lidar import LIDARS
 from model_training.simulation.simulate import _city
 from model_training.training.recipe import EVALUATION_SEEDS
 
@@ -24,7 +28,8 @@ OWN = (
     [unseen_plan(k) for k in range(3)]
     + [large_plan(k) for k in range(3)]
     + [more_plan(k) for k in range(3)]
-    + [hard_plan(), lidar_16_plan(), repeating_plan(), *(height_plan(height_m) for height_m in HEIGHTS_M)]
+    + [hard_plan(), lidar_16_plan(), lidar_os0_plan(), repeating_plan()]
+    + [height_plan(height_m) for height_m in HEIGHTS_M]
 )
 
 
@@ -64,6 +69,19 @@ def test_every_hard_condition_stands_beside_a_clear_day():
     assert {query.count for query in plan.queries[:-1]} == {500}
     assert plan.queries[-1].sequence == SEQUENCE
     assert lidar_16_plan().queries[0] == plan.queries[0]
+
+
+def test_the_survey_of_the_os0_differs_from_the_sparse_one_by_its_lidar_only():
+    """Its map answers the queries of ``hard_plan``, so it has the same city and none of its own."""
+    plan, other = lidar_os0_plan(), hard_plan()
+    assert (plan.lidar, plan.spacing_m, plan.queries) == ("os0_128", SPARSE_M, ())
+    changed = {"name", "lidar", "spacing_m", "queries"}
+    assert plan.model_dump(exclude=changed) == other.model_dump(exclude=changed)
+    model = LIDARS[plan.lidar]
+    rays = model.rays().reshape(model.channels, model.columns, 3)[:, 0]
+    elevation_deg = np.rad2deg(np.arcsin(rays[:, 2]))
+    np.testing.assert_allclose(np.diff(elevation_deg), -90 / 127, atol=1e-4)
+    np.testing.assert_allclose(elevation_deg[[0, -1]], [45.0, -45.0], atol=1e-4)
 
 
 def test_the_repeating_street_has_room_for_its_sequences():
