@@ -159,6 +159,12 @@ TILED_AND_STORED = (
 )
 #: The comparison of the stages of an answer with its ground truth.
 STAGES = "model_training/evaluation/stages.py"
+#: ``map update``. Among the rows of ``accuracy``, only surveys of two passes run it.
+_UPDATE = (
+    "model_training/mapping/area.py",
+    "model_training/mapping/stored_map.py",
+    "model_training/mapping/update.py",
+)
 #: Files in the folders above that no row of a report runs: tiled maps, object storage, Qdrant, commands for finished maps, and the
 #: comparison of stages. A test checks that the benchmark loads none of them.
 NOT_RUN: dict[str, tuple[str, ...]] = {
@@ -167,27 +173,29 @@ NOT_RUN: dict[str, tuple[str, ...]] = {
         "service/localization/track_bytes.py",
         "model_training/datasets/stored_survey.py",
         "model_training/datasets/survey_part.py",
-        "model_training/mapping/area.py",
         "model_training/mapping/build_tile.py",
         "model_training/mapping/build_tiled.py",
         "model_training/mapping/diff.py",
         "model_training/mapping/engines.py",
         "model_training/mapping/merge.py",
-        "model_training/mapping/stored_map.py",
         "model_training/mapping/tiled_care.py",
-        "model_training/mapping/update.py",
         "model_training/mapping/update_tiled.py",
         "model_training/mapping/verify.py",
         STAGES,
     ),
     **dict.fromkeys(("choices", "kitti", "paper"), (STAGES,)),
 }
-NOT_RUN["real_data"] = tuple(
-    file for file in NOT_RUN["accuracy"] if file.startswith("model_training/") and file != STAGES
+NOT_RUN["real_data"] = (
+    *_UPDATE,
+    *(file for file in NOT_RUN["accuracy"] if file.startswith("model_training/") and file != STAGES),
 )
 #: Files that only some rows of a report run, by the beginning of their ids.
 ONLY_RUN_BY: dict[str, dict[str, tuple[str, ...]]] = {
-    "accuracy": {"service/localization/tracker.py": ("filter.",), "service/maps/inverted_file.py": ()},
+    "accuracy": {
+        "service/localization/tracker.py": ("filter.",),
+        "service/maps/inverted_file.py": (),
+        **dict.fromkeys(_UPDATE, ("survey.two_passes_",)),
+    },
     "real_data": {
         STAGES: tuple(f"real.kitti_{drive}.{row}" for drive in ("0005", "0013") for row in ("inliers", "retrieval_at")),
         "service/localization/tracker.py": ("real.track.", "ros2."),

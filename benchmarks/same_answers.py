@@ -36,8 +36,9 @@ COVERED = {
     ),
     "real_data": ("real.kitti_", "real.strangers.", "real.sequence5.", "real.track."),
 }
-#: Beginnings of the ids of rows among them that it does not cover, because a calibration is made for them.
+#: Beginnings of the ids of rows among them that it does not cover, because a map is updated or a calibration is made for them.
 NOT_COVERED = {
+    "accuracy": ("survey.two_passes_",),
     "real_data": tuple(f"real.kitti_{drive}.ece_after_rig_calibration" for drive in ("0005", "0013")),
 }
 #: Answers that a change may alter on purpose: their files, and the beginnings of the rows that the check then does not cover.
