@@ -7,14 +7,15 @@ import typer
 from rich.console import Console
 
 from model_training.cli.progress import bars
+from model_training.cli.rig_option import depths_of, rig_lines, rig_named, sensors_of, simulate_rig
 from model_training.cli.sensor_options import sensor_parameters
 from model_training.simulation.lidar import LIDARS
 from model_training.simulation.plan import CameraPlan, QueryPlan, SimulationPlan
 from model_training.simulation.sensor_parameters import DepthParameters, RgbParameters, StereoParameters
-from model_training.simulation.simulate import simulate
 from service.errors import DatasetError
 
-EXAMPLE = """Simulate a city, its LiDAR survey and its RGB-D query traversals.
+_RIGS = "\n".join(f"  {line}" for line in rig_lines())
+EXAMPLE = f"""Simulate a city, its LiDAR survey and its RGB-D query traversals.
 
 The command writes a dataset folder.
 The same command resumes an interrupted run.
@@ -32,6 +33,13 @@ Examples:
 
 \b
   streetfix simulate --lidar os1_128 --rgb small --set lidar.channels=64 --set rgb.noise=2 --set depth.noise_px=0.3 --out data/others
+
+\b
+  streetfix simulate --rig d435 --queries 100 --out data/d435
+
+\b
+Rigs (--rig), with image size, depth, LiDAR and distance between its scans:
+{_RIGS}
 """
 
 
@@ -50,8 +58,18 @@ def command(
         str | None, typer.Option(help="Extents of a random city, metres, 30 to 10000 each.  [default: 300x400]")
     ] = None,
     streets: Annotated[str, typer.Option(help="Drive only these streets, such as 1,5,between.")] = "",
-    lidar: Annotated[str, typer.Option(help=f"LiDAR preset: {', '.join(LIDARS)}.")] = "paper_32",
-    spacing: Annotated[float, typer.Option(help="Distance between scans, metres.", min=0.02)] = 1.0,
+    rig: Annotated[
+        str | None,
+        typer.Option(
+            help="Rig preset, listed above: camera, depth, LiDAR and survey. Other options replace single values of it."
+        ),
+    ] = None,
+    lidar: Annotated[
+        str | None, typer.Option(help=f"LiDAR preset: {', '.join(LIDARS)}.  [default: paper_32, or the rig's]")
+    ] = None,
+    spacing: Annotated[
+        float | None, typer.Option(help="Distance between scans, metres.  [default: 1, or the rig's]", min=0.02)
+    ] = None,
     queries: Annotated[int, typer.Option(help="Queries of each query traversal. 0 simulates none.", min=0)] = 200,
     drives: Annotated[
         int, typer.Option(help="Query traversals. Each has its own vehicles, people and light.", min=1)
@@ -71,7 +89,7 @@ def command(
         list[str] | None,
         typer.Option(
             help="ideal, precise or stereo: modelled depth error. sgbm, sgbm3way or bm: depth from a rendered and "
-            "matched stereo pair. Repeat for several of one sort.  [default: precise]"
+            "matched stereo pair. Repeat for several of one sort.  [default: precise, or the rig's]"
         ),
     ] = None,
     rgb: Annotated[
@@ -141,16 +159,28 @@ def command(
             ),
         ),
     ] = None,
-    camera: Annotated[str, typer.Option(help="Image size, pixels, up to 4096x4096.")] = "640x480",
-    hfov: Annotated[float, typer.Option(help="Horizontal field of view, degrees.", min=20, max=150)] = 90.0,
+    camera: Annotated[
+        str | None, typer.Option(help="Image size, pixels, up to 4096x4096.  [default: 640x480, or the rig's]")
+    ] = None,
+    hfov: Annotated[
+        float | None,
+        typer.Option(help="Horizontal field of view, degrees.  [default: 90, or the rig's]", min=20, max=150),
+    ] = None,
     workers: Annotated[int | None, typer.Option(help="Processes.  [default: one per core]", min=1)] = None,
 ) -> None:
     """See ``EXAMPLE``, which the command line shows."""
     lidar_parameters, rgb_parameters, depth_parameters, stereo_parameters, survey_parameters = sensor_parameters(
         settings or []
     )
+    untaken = (depth_parameters, rgb_parameters, stereo_parameters)
+    own = None if rig is None else rig_named(rig)
+    if own is not None:
+        depth_parameters, stereo_parameters, survey_parameters = sensors_of(
+            own, depth_parameters, stereo_parameters, survey_parameters, survey_error=survey_error
+        )
     of_all: dict[str, object] = {
-        "depths": tuple(depth or ["precise"]),
+        "depths": tuple(depth or ["precise"]) if own is None else depths_of(own, depth or []),
+        "cameras": None if own is None or own.cameras == 1 else own.cameras,
         "condition": condition,
         "turn_deg": turn,
         "pitch_deg": pitch,
@@ -170,16 +200,15 @@ def command(
         given = of_all | of_drives | {"count": max(1, queries), "per_class": table1}
         plans = [QueryPlan.model_validate(given | {"name": f"drive{k}", "traversal": k}) for k in range(1, drives + 1)]
     if on_track:
-        own = of_all | {"name": "survey_drive", "traversal": 0, "count": on_track, "on_track": True}
+        tracked = of_all | {"name": "survey_drive", "traversal": 0, "count": on_track, "on_track": True}
         # Without any drive nothing would take these three: the plan refuses them rather than pass them over.
-        plans.append(QueryPlan.model_validate(own if plans else own | of_drives))
+        plans.append(QueryPlan.model_validate(tracked if plans else tracked | of_drives))
     looks = {"rgb": None if rgb == "automatic" else rgb, "sun-elevation": sun_elevation, "sun-azimuth": sun_azimuth}
     for option, value in looks.items():
         if not plans and value is not None:
             raise DatasetError(
                 f"{option}: this option has no effect without queries; set --queries, or omit the option", field=option
             )
-    untaken = (depth_parameters, rgb_parameters, stereo_parameters)
     if not plans and untaken != (DepthParameters(), RgbParameters(), StereoParameters()):
         raise DatasetError(
             "set: without queries only parameters of lidar and survey have an effect; set --queries, or set only those",
@@ -189,24 +218,30 @@ def command(
         raise DatasetError(f"city: {city!r} is not valid; choose paper, city or mixed", field="city")
     if city == "paper" and size is not None:
         raise DatasetError("size: the paper's city has a fixed size; omit --size, or use --city city", field="size")
-    width, height = _pair(camera, "camera", least=48, most=4096)
+    lens = CameraPlan() if own is None else own.camera
+    width, height = (lens.width, lens.height) if camera is None else _pair(camera, "camera", least=48, most=4096)
     plan = SimulationPlan(
         name=name or out.name,
         city=cast(Literal["paper", "city", "mixed"], city),
         seed=seed,
         size_m=_pair(size or "300x400", "size", least=30, most=10_000),
         streets=tuple(s for s in streets.split(",") if s),
-        lidar=lidar,
-        spacing_m=spacing,
+        lidar=lidar if lidar is not None else "paper_32" if own is None else own.lidar,
+        spacing_m=spacing if spacing is not None else 1.0 if own is None else own.spacing_m,
         survey_condition=survey_condition,
         survey_error=survey_error,
-        camera=CameraPlan.model_validate({"width": width, "height": height, "horizontal_deg": hfov}),
+        camera=CameraPlan.model_validate(
+            {"width": width, "height": height, "horizontal_deg": lens.horizontal_deg if hfov is None else hfov}
+        ),
         queries=tuple(plans),
         lidar_parameters=lidar_parameters,
         survey_parameters=survey_parameters,
     )
+    if own is not None:
+        heights_m = {"camera_height_m": own.camera_height_m, "lidar_height_m": own.lidar_height_m}
+        plan = plan.model_copy(update=heights_m)
     with bars() as report:
-        simulate(plan, out, workers=workers, report=report)
+        simulate_rig(plan, out, () if own is None else own.beams, workers=workers, report=report)
     Console().print(f"dataset {plan.name}: {out}")
 
 
