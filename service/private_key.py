@@ -1,4 +1,4 @@
-"""Encrypted private keys are refused, by the client and by the service. This module imports nothing, so the service starts without httpx."""
+"""Encrypted private keys are refused by the client and by the service. This module imports nothing: the service needs no httpx to start."""
 
 
 class EncryptedKeyError(Exception):
