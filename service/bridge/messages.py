@@ -1,7 +1,7 @@
 """Messages of ROS 2 for DDS. Type names and fields are those of rosidl, so that a ROS node on the same domain can read them.
 
-Definitions: common_interfaces and rcl_interfaces (builtin_interfaces, std_msgs, geometry_msgs, sensor_msgs, diagnostic_msgs) of
-ROS 2 Humble. Later versions are the same. A ROS topic ``/a`` is the DDS topic ``rt/a``.
+Definitions: common_interfaces and rcl_interfaces (builtin_interfaces, std_msgs, geometry_msgs, sensor_msgs, nav_msgs, diagnostic_msgs) of
+ROS 2 Humble. Later versions are the same. TFMessage is from geometry2 (tf2_msgs). A ROS topic ``/a`` is the DDS topic ``rt/a``.
 """
 
 from collections.abc import Sequence
@@ -89,6 +89,39 @@ class Quaternion(IdlStruct, typename="geometry_msgs.msg.dds_.Quaternion_"):
 
 
 @dataclass
+class Vector3(IdlStruct, typename="geometry_msgs.msg.dds_.Vector3_"):
+    """A vector."""
+
+    x: float64 = 0.0
+    y: float64 = 0.0
+    z: float64 = 0.0
+
+
+@dataclass
+class Transform(IdlStruct, typename="geometry_msgs.msg.dds_.Transform_"):
+    """Translation (metres) and rotation from the child frame to its parent."""
+
+    translation: Vector3 = field(default_factory=Vector3)
+    rotation: Quaternion = field(default_factory=Quaternion)
+
+
+@dataclass
+class TransformStamped(IdlStruct, typename="geometry_msgs.msg.dds_.TransformStamped_"):
+    """A transform; the frame of the header is the parent."""
+
+    header: Header = field(default_factory=Header)
+    child_frame_id: str = ""
+    transform: Transform = field(default_factory=Transform)
+
+
+@dataclass
+class TFMessage(IdlStruct, typename="tf2_msgs.msg.dds_.TFMessage_"):
+    """Transforms of TF."""
+
+    transforms: Annotated[Sequence[TransformStamped], sequence(TransformStamped)] = field(default_factory=list)
+
+
+@dataclass
 class Pose(IdlStruct, typename="geometry_msgs.msg.dds_.Pose_"):
     """Position and orientation."""
 
@@ -110,6 +143,52 @@ class PoseWithCovarianceStamped(IdlStruct, typename="geometry_msgs.msg.dds_.Pose
 
     header: Header = field(default_factory=Header)
     pose: PoseWithCovariance = field(default_factory=PoseWithCovariance)
+
+
+@dataclass
+class Twist(IdlStruct, typename="geometry_msgs.msg.dds_.Twist_"):
+    """Linear (m/s) and angular (rad/s) velocity."""
+
+    linear: Vector3 = field(default_factory=Vector3)
+    angular: Vector3 = field(default_factory=Vector3)
+
+
+@dataclass
+class TwistWithCovariance(IdlStruct, typename="geometry_msgs.msg.dds_.TwistWithCovariance_"):
+    """A velocity and its (6, 6) covariance, stored row by row."""
+
+    twist: Twist = field(default_factory=Twist)
+    covariance: Annotated[Sequence[float], array(float64, 36)] = field(default_factory=lambda: [0.0] * 36)
+
+
+@dataclass
+class Odometry(IdlStruct, typename="nav_msgs.msg.dds_.Odometry_"):
+    """Pose of the child frame in the frame of the header, and its velocity in the child frame."""
+
+    header: Header = field(default_factory=Header)
+    child_frame_id: str = ""
+    pose: PoseWithCovariance = field(default_factory=PoseWithCovariance)
+    twist: TwistWithCovariance = field(default_factory=TwistWithCovariance)
+
+
+@dataclass
+class Imu(IdlStruct, typename="sensor_msgs.msg.dds_.Imu_"):
+    """Orientation in a frame whose z axis points up, angular velocity (rad/s) and acceleration (m/s2).
+
+    A first covariance of -1 means that the quantity is not measured.
+    """
+
+    header: Header = field(default_factory=Header)
+    orientation: Quaternion = field(default_factory=Quaternion)
+    orientation_covariance: Annotated[Sequence[float], array(float64, 9)] = field(default_factory=lambda: [0.0] * 9)
+    angular_velocity: Vector3 = field(default_factory=Vector3)
+    angular_velocity_covariance: Annotated[Sequence[float], array(float64, 9)] = field(
+        default_factory=lambda: [0.0] * 9
+    )
+    linear_acceleration: Vector3 = field(default_factory=Vector3)
+    linear_acceleration_covariance: Annotated[Sequence[float], array(float64, 9)] = field(
+        default_factory=lambda: [0.0] * 9
+    )
 
 
 @dataclass

@@ -47,6 +47,72 @@ def info(stamp_ns: int = 0, **changed: Any) -> Any:
     return SimpleNamespace(**(fields | changed))
 
 
+def place(*numbers: float) -> Any:
+    """Return a Point, or a Vector3."""
+    return SimpleNamespace(**dict(zip("xyz", numbers, strict=True)))
+
+
+def turn(*numbers: float) -> Any:
+    """Return a geometry_msgs/Quaternion."""
+    return SimpleNamespace(**dict(zip("xyzw", numbers, strict=True)))
+
+
+def fixed(*transforms: tuple[str, str, tuple[float, ...]]) -> Any:
+    """Return a tf2_msgs/TFMessage of (parent, child, x, y, z and the quaternion of the child in the parent)."""
+    return SimpleNamespace(
+        transforms=[
+            SimpleNamespace(
+                header=SimpleNamespace(frame_id=parent),
+                child_frame_id=child,
+                transform=SimpleNamespace(translation=place(*numbers[:3]), rotation=turn(*numbers[3:])),
+            )
+            for parent, child, numbers in transforms
+        ]
+    )
+
+
+def odometry(
+    stamp_ns: int, x: float, y: float, yaw_deg: float = 0.0, *, frame: str = "odom", child: str = "base_link"
+) -> Any:
+    """Return a nav_msgs/Odometry of a vehicle on level ground."""
+    half = np.deg2rad(yaw_deg) / 2
+    pose = SimpleNamespace(position=place(x, y, 0.0), orientation=turn(0.0, 0.0, np.sin(half), np.cos(half)))
+    return SimpleNamespace(
+        header=header_of(stamp_ns, frame), child_frame_id=child, pose=SimpleNamespace(pose=pose, covariance=[0.0] * 36)
+    )
+
+
+def initial_pose(
+    x: float,
+    y: float,
+    yaw_deg: float = 0.0,
+    *,
+    variances: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    frame: str = "map",
+    stamp_ns: int = 0,
+) -> Any:
+    """Return a geometry_msgs/PoseWithCovarianceStamped with the variances of x, y (m2) and yaw (rad2)."""
+    message = odometry(stamp_ns, x, y, yaw_deg, frame=frame)
+    for index, variance in zip((0, 7, 35), variances, strict=True):
+        message.pose.covariance[index] = variance
+    return message
+
+
+@pytest.fixture(scope="session")
+def fixed_of() -> Callable[..., Any]:
+    return fixed
+
+
+@pytest.fixture(scope="session")
+def odometry_of() -> Callable[..., Any]:
+    return odometry
+
+
+@pytest.fixture(scope="session")
+def initial_pose_of() -> Callable[..., Any]:
+    return initial_pose
+
+
 @pytest.fixture(scope="session")
 def image_of() -> Callable[..., Any]:
     return image
@@ -127,7 +193,9 @@ class Ros:
 
     def get_logger(self) -> Any:
         return SimpleNamespace(
-            info=lambda text: self.logged.append(("info", text)), fatal=lambda text: self.logged.append(("fatal", text))
+            info=lambda text: self.logged.append(("info", text)),
+            warning=lambda text: self.logged.append(("warning", text)),
+            fatal=lambda text: self.logged.append(("fatal", text)),
         )
 
     def create_subscription(self, kind: Any, topic: str, heard: Any, qos: Any) -> None:
@@ -159,6 +227,7 @@ def ros(monkeypatch: pytest.MonkeyPatch) -> Ros:
     qos = SimpleNamespace(
         HistoryPolicy=SimpleNamespace(KEEP_LAST="last", KEEP_ALL="all"),
         ReliabilityPolicy=SimpleNamespace(RELIABLE="reliable", BEST_EFFORT="best effort"),
+        DurabilityPolicy=SimpleNamespace(TRANSIENT_LOCAL="latched", VOLATILE="volatile"),
         QoSProfile=SimpleNamespace,
     )
     modules: dict[str, Any] = {
@@ -174,7 +243,11 @@ def ros(monkeypatch: pytest.MonkeyPatch) -> Ros:
         "rcl_interfaces": SimpleNamespace(),
         "rcl_interfaces.msg": SimpleNamespace(ParameterDescriptor=SimpleNamespace),
         "sensor_msgs": SimpleNamespace(),
-        "sensor_msgs.msg": SimpleNamespace(Image="Image", CameraInfo="CameraInfo"),
+        "sensor_msgs.msg": SimpleNamespace(Image="Image", CameraInfo="CameraInfo", Imu="Imu"),
+        "nav_msgs": SimpleNamespace(),
+        "nav_msgs.msg": SimpleNamespace(Odometry="Odometry"),
+        "tf2_msgs": SimpleNamespace(),
+        "tf2_msgs.msg": SimpleNamespace(TFMessage="TFMessage"),
         "geometry_msgs": SimpleNamespace(),
         "geometry_msgs.msg": SimpleNamespace(PoseWithCovarianceStamped=posed_message),
         "diagnostic_msgs": SimpleNamespace(),
