@@ -13,6 +13,7 @@ import pytest
 from numpy.typing import NDArray
 
 from model_training.mapping.voxel_map import VoxelMap
+from service.confidence.features import FEATURES
 from service.geometry.camera import PinholeCamera
 from service.geometry.distortion import rays_of
 from service.geometry.rigid import R_BODY_OPTICAL, rotation_z, transform_from, transform_points
@@ -160,6 +161,23 @@ def make_content(*, name: str = "tiny", seed: int = 0, **changed: Any) -> Bundle
     return BundleContent(**(given | changed))
 
 
+def make_constant_calibration(*, right: float, known: float, threshold: float) -> dict[str, Any]:
+    """A calibration with one confidence and one probability of being in the map for all answers, and no evidence out of range."""
+
+    def log_odds(probability: float) -> float:
+        return float(np.log(probability / (1 - probability)))
+
+    return {
+        "calibrated": True,
+        "features": [{"name": name, "mean": 0.0, "std": 1e6} for name in FEATURES],
+        "right": {"terms": [], "bias": log_odds(right)},
+        "known": {"terms": [], "bias": log_odds(known)},
+        "thresholds": [{"false_accept_rate": 0.01, "confidence": threshold}],
+        "site": None,
+        "measured_on": {"cities": "none", "queries": 0},
+    }
+
+
 def jpeg_of(rgb: NDArray[np.uint8]) -> bytes:
     """Lossless, despite the name of the part's usual format: the golden answer must not hang on a codec."""
     return cv2.imencode(".png", cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR))[1].tobytes()
@@ -220,6 +238,11 @@ def bundle_copy(content: BundleContent, tmp_path: Path) -> Path:
 def content_of() -> Callable[..., BundleContent]:
     """The factory itself: test modules are no package and cannot import this file."""
     return make_content
+
+
+@pytest.fixture(scope="session")
+def constant_calibration() -> Callable[..., dict[str, Any]]:
+    return make_constant_calibration
 
 
 @pytest.fixture(scope="session")

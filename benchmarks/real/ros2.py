@@ -82,9 +82,10 @@ class Robot:
         self._domain = Domain(domain, LOOPBACK)  # leaves the environment of this process unchanged
         self._participant = DomainParticipant(domain)
         topics = Topics()
-        self._color = self._of(DataWriter, topics.color, messages.Image)
-        self._depth = self._of(DataWriter, topics.depth, messages.Image)
-        self._info = self._of(DataWriter, topics.info, messages.CameraInfo)
+        self._writers: list[Any] = []
+        self._color = self.writer(topics.color, messages.Image)
+        self._depth = self.writer(topics.depth, messages.Image)
+        self._info = self.writer(topics.info, messages.CameraInfo)
         # This reader exists before that of the diagnostics. So a bridge that knows the second reader knows the first too.
         self._poses = self._of(DataReader, topics.pose, messages.PoseWithCovarianceStamped)
         self._diagnostics = self._of(DataReader, topics.diagnostics, messages.DiagnosticArray)
@@ -101,6 +102,23 @@ class Robot:
         """Number of sent frames."""
         return len(self._stamps)
 
+    @property
+    def is_connected(self) -> bool:
+        """Whether a bridge subscribes to all topics, and its diagnostics arrive."""
+        return self._has_diagnostics and all(writer.get_matched_subscriptions() for writer in self._writers)
+
+    def writer(self, topic: str, kind: type, *, latched: bool = False) -> Any:
+        """Return a writer of another topic. The bridge must subscribe to this topic too, or the robot is not connected.
+
+        Args:
+            topic: name in ROS.
+            kind: type of the messages.
+            latched: a late reader gets the last messages too.
+        """
+        made = self._of(DataWriter, topic, kind, latched=latched)
+        self._writers.append(made)
+        return made
+
     def connect(self, process: "subprocess.Popen[bytes]", patience_s: float) -> None:
         """Wait until the bridge subscribes to all topics and its diagnostics arrive.
 
@@ -112,13 +130,12 @@ class Robot:
             UnreachableError: the bridge has ended, or sends no diagnostics.
         """
 
-        def is_connected() -> bool:
+        def is_ready() -> bool:
             if process.poll() is not None:
                 raise UnreachableError(f"the bridge ended with {process.returncode}; see its messages above")
-            writers = (self._color, self._depth, self._info)
-            return self._has_diagnostics and all(writer.get_matched_subscriptions() for writer in writers)
+            return self.is_connected
 
-        if not self.wait(is_connected, patience_s):
+        if not self.wait(is_ready, patience_s):
             raise UnreachableError(
                 f"no message from the bridge within {patience_s:g} s; check that this machine has a loopback interface"
             )
@@ -171,11 +188,11 @@ class Robot:
             self.refused += values.get("status") in ("AMBIGUOUS", "OUT_OF_MAP")
         return (self._has_diagnostics, self.queries, len(self.posed)) != before
 
-    def _of(self, end: Any, topic: str, kind: type) -> Any:
+    def _of(self, end: Any, topic: str, kind: type, *, latched: bool = False) -> Any:
         return end(
             self._participant,
             Topic(self._participant, dds_name(topic), kind),
-            qos=qos_of(reliable=True, depth=0),
+            qos=qos_of(reliable=True, depth=0, latched=latched),
         )
 
 
@@ -191,7 +208,8 @@ def _image(header: messages.Header, encoding: str, picture: NDArray[Any]) -> mes
 def _bridge(url_or_bundle: str, domain: int) -> "Iterator[subprocess.Popen[bytes]]":
     """Run the command in its own process; SIGINT ends it."""
     where = ["--url" if "://" in url_or_bundle else "--map", url_or_bundle]
-    open_gates = ["--rate", "0", "--min-confidence", "0", "--reliable", "--queue", "0"]
+    # The robot publishes images only.
+    open_gates = ["--rate", "0", "--min-confidence", "0", "--reliable", "--queue", "0", "--tf-static-topic", ""]
     process = subprocess.Popen(
         [
             sys.executable,

@@ -1,17 +1,21 @@
 """Ask a service for the pose of an image pair."""
 
+import math
+
 import numpy as np
 from numpy.typing import NDArray
 
-from service.bridge.known import Known
+from service.bridge.known import Known, Motion
 from service.client import Client
-from service.client.prepare import RequestOptions
-from service.contract.schema import LocalizeAnswer
+from service.client.prepare import RequestOptions, Track
+from service.contract import schema
+from service.errors import RefusedError
 from service.geometry.camera import PinholeCamera
+from service.retrieval.prior import Prior
 
 
 class AskService:
-    """Sends image pairs to a service.
+    """Sends image pairs to a service, and carries the belief of a track from answer to query.
 
     Args:
         client: of the service.
@@ -20,11 +24,14 @@ class AskService:
 
     def __init__(self, client: Client, map_name: str | None = None) -> None:
         self._client, self._map_name = client, map_name
+        self._before: schema.LocalizeAnswer | None = None
 
     def __call__(
         self, rgb: NDArray[np.uint8], depth_m: NDArray[np.float32], camera: PinholeCamera, known: Known
-    ) -> LocalizeAnswer:
+    ) -> schema.LocalizeAnswer:
         """Localize an image pair.
+
+        If the service refuses the track, for example because it was restarted, the next query begins another track.
 
         Args:
             rgb: sRGB image, (H, W, 3).
@@ -35,7 +42,14 @@ class AskService:
         Raises:
             StreetfixError: as ``Client.localize``.
         """
-        return self._client.localize(rgb, depth_m, camera, **self._about(known))
+        try:
+            answer = self._client.localize(rgb, depth_m, camera, **self._about(known))
+        except RefusedError as error:
+            if error.field.startswith("track"):
+                self._before = None
+            raise
+        self._before = None if known.motion is None else answer
+        return answer
 
     def _about(self, known: Known) -> RequestOptions:
         """Return the optional data of the request. An earlier service does not know all of them, so only known facts are sent."""
@@ -44,4 +58,25 @@ class AskService:
             about["baseline_m"] = known.baseline_m
         if (height := known.camera_height) is not None:
             about["camera_height_m"], about["camera_height_std_m"] = height.height_m, height.std_m
+        if known.down_camera is not None:
+            about["gravity"] = known.down_camera
+        if known.prior is not None:
+            about["prior"] = _prior(known.prior)
+        if known.motion is not None:
+            about["track"] = self._track(known.motion)
         return about
+
+    def _track(self, motion: Motion) -> Track:
+        if self._before is None:
+            return Track()
+        return Track(before=self._before, T_previous_camera=motion.T_previous_camera)
+
+
+def _prior(prior: Prior) -> schema.Prior:
+    """Convert a prior to the contract."""
+    position = None
+    if prior.position_m is not None:
+        x, y = prior.position_m.tolist()
+        position = schema.PriorPosition(x=x, y=y, std_m=prior.position_std_m)
+    heading_deg = None if prior.heading_rad is None else math.degrees(prior.heading_rad)
+    return schema.Prior(position=position, heading_deg=heading_deg, heading_std_deg=math.degrees(prior.heading_std_rad))

@@ -77,10 +77,10 @@ def of_answer(
         why_not: why the pose was not published; empty if it was.
         stamp_ns: of the RGB image, ns.
         latency_s: from the query to the answer, s.
-        counted: names and values of ``Counts.values``.
+        counted: further names and values, such as those of ``Counts.values``.
     """
     confidence = "unknown" if answer.confidence is None else f"{answer.confidence:.3f}"
-    height = answer.camera_height
+    height, belief = answer.camera_height, answer.belief
     values = (
         ("status", answer.status),
         ("confidence", confidence),
@@ -88,6 +88,7 @@ def of_answer(
         ("map", f"{answer.map.name}@{answer.map.version}"),
         ("camera_height", "unknown" if height is None else f"{height.height_m:.2f} m, {height.origin}"),
         ("calibration", answer.calibration or "unknown"),
+        ("belief", "none" if belief is None or not belief.modes else f"{belief.modes[0].weight:.3f}"),
         ("latency_ms", f"{1e3 * latency_s:.0f}"),
     )
     if why_not:

@@ -1,4 +1,4 @@
-"""The pipeline in the process of the bridge, without a service and without encoded images."""
+"""The pipeline in the process of the bridge, without a service and without encoded images. It keeps the track of the robot."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -6,14 +6,16 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from service.bridge.known import Known
+from service.bridge.known import Known, Motion
 from service.contract.convert import answer_from, require_camera
 from service.contract.schema import LocalizeAnswer
 from service.geometry.camera import PinholeCamera
 from service.imaging.decode import require_sizes
 from service.imaging.depth_units import depth_from_values
+from service.localization.answer import Answer
+from service.localization.tracker import Track, follow
 from service.retrieval.query import Query
-from service.runtime.engine import Located
+from service.runtime.engine import Located, expect_next
 from service.runtime.map_registry import MapRegistry
 from service.runtime.threads import limit_pools
 
@@ -31,6 +33,7 @@ class InPlace:
     def __init__(self, bundle: Path) -> None:
         limit_pools()
         self._localizer = MapRegistry.open((bundle,)).get(None)
+        self._track = Track()
 
     def __call__(
         self, rgb: NDArray[np.uint8], depth_m: NDArray[np.float32], camera: PinholeCamera, known: Known
@@ -50,6 +53,16 @@ class InPlace:
         z_m = depth_from_values(depth_m, scale_m=1.0, kind="z", camera=camera, baseline_m=None, max_range_m=None)
         require_sizes(rgb, z_m, camera)
         pair = Query.of_images(rgb, z_m, camera, baseline_m=known.baseline_m)
-        query = replace(pair, camera_height=known.camera_height)
-        answer = self._localizer.localize(query)
-        return answer_from(Located(answer, self._localizer.bundle))
+        query = replace(pair, camera_height=known.camera_height, down_camera=known.down_camera, prior=known.prior)
+        return answer_from(Located(self._answer(query, known.motion), self._localizer.bundle))
+
+    def _answer(self, query: Query, motion: Motion | None) -> Answer:
+        """Answer a query alone, or as the next one of the track, as a stream of the service does."""
+        if motion is None:
+            answer = self._localizer.localize(query)
+            self._track = Track()
+            return answer
+        frame, T_previous_camera = self._localizer.encode_and_search(query), motion.T_previous_camera
+        answer, self._track = follow(self._localizer, frame, self._track, T_previous_camera)
+        expect_next(self._localizer.bundle, self._track, T_previous_camera)
+        return answer

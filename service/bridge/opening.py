@@ -5,13 +5,19 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 
 from service.bridge.bridge import Bridge, Localize, Topics
+from service.bridge.gravity import Imu
+from service.bridge.initial_pose import InitialPoses
+from service.bridge.mounting import MountingRule
+from service.bridge.notices import Notices
+from service.bridge.odometry import Odometry
 from service.bridge.pairs import Pairs
-from service.bridge.pose import CAMERA_AS_BODY, height_from, mount_from
+from service.bridge.pose import height_on_mount, measured_height, mount_from
 from service.bridge.publish_policy import PublishPolicy
 from service.bridge.rig import StereoRig
 from service.bridge.robot import Robot
 from service.bridge.settings import BridgeSettings
 from service.errors import RequestError
+from service.option_limits import LEAST_HEIGHT_STD_M, MOST_HEIGHT_STD_M, VEHICLE_HEIGHT_STD_M
 from service.runtime.wakeup import Wakeup
 
 #: Limits of a query. After a longer time the robot has left the place of the images.
@@ -38,10 +44,13 @@ def opened(settings: BridgeSettings) -> Iterator[Bridge]:
         settings.pose_topic,
         settings.diagnostics_topic,
         right_info=rig.topic,
+        tf_static=settings.tf_static_topic,
+        odom=settings.odom_topic,
+        imu=settings.imu_topic if settings.gravity == "imu" else "",
+        prior=settings.prior_topic,
     )
     policy, pairs = PublishPolicy(settings.rate, settings.min_confidence), Pairs(tolerance_s=settings.tolerance)
-    mount = None if settings.mount is None else mount_from(settings.mount)
-    height = height_from(settings.camera_height_m, mount, base_on_ground=settings.base_on_ground)
+    robot = _robot(settings, rig)
     if settings.queue < 0:
         raise RequestError(
             f"--queue: {settings.queue} is not a valid number of images; give 1 or more, or 0 to keep all",
@@ -53,11 +62,77 @@ def opened(settings: BridgeSettings) -> Iterator[Bridge]:
             topics=topics,
             policy=policy,
             pairs=pairs,
-            robot=Robot(rig=rig, camera_height=height),
-            T_vehicle_camera=CAMERA_AS_BODY if mount is None else mount,
+            robot=robot,
             frame_id=settings.frame,
             rectified=settings.rectified,
         )
+
+
+def _robot(settings: BridgeSettings, rig: StereoRig) -> Robot:
+    """Return the robot of the settings.
+
+    Raises:
+        RequestError: a setting makes no sense, or contradicts another one.
+    """
+    notices = Notices()
+    if settings.gravity not in ("mounting", "imu", "none"):
+        raise RequestError(
+            f"--gravity: {settings.gravity!r} is not a source of gravity; give mounting, imu or none", field="gravity"
+        )
+    if settings.gravity == "imu" and not (settings.imu_topic and settings.tf_static_topic):
+        raise RequestError(
+            "--gravity: imu needs the IMU and its mounting, but --imu-topic or --tf-static-topic is empty; give both, or pass "
+            "--gravity mounting",
+            field="gravity",
+        )
+    return Robot(
+        rig=rig,
+        rule=_rule(settings),
+        gravity=settings.gravity,
+        odometry=Odometry(settings.odom_topic, notices) if settings.odom_topic else None,
+        imu=Imu(settings.imu_topic, notices) if settings.gravity == "imu" else None,
+        initial_poses=InitialPoses(settings.prior_topic, settings.frame, settings.prior_age, notices)
+        if settings.prior_topic
+        else None,
+        notices=notices,
+    )
+
+
+def _rule(settings: BridgeSettings) -> MountingRule:
+    """Return how to find the mounting of the camera.
+
+    Raises:
+        RequestError: a setting makes no sense, or contradicts another one.
+    """
+    std_m = settings.camera_height_std_m
+    if std_m and not LEAST_HEIGHT_STD_M <= std_m <= MOST_HEIGHT_STD_M:
+        raise RequestError(
+            f"--camera-height-std-m: {std_m:g} m is not a valid standard deviation; give {LEAST_HEIGHT_STD_M:g} to "
+            f"{MOST_HEIGHT_STD_M:g} m, or 0 for the usual one",
+            field="camera_height_std_m",
+        )
+    mount = None if settings.mount is None else mount_from(settings.mount)
+    height, over_ground_std_m = measured_height(settings.camera_height_m, std_m), std_m or VEHICLE_HEIGHT_STD_M
+    base_frame, ground_frame = settings.base_frame, settings.ground_frame
+    if not settings.tf_static_topic:
+        base_frame = ground_frame = ""
+    if settings.base_on_ground:
+        ground_frame = base_frame
+        if mount is not None:
+            ground_frame, height = "", height or height_on_mount(mount, over_ground_std_m)
+        elif not base_frame and height is None:
+            raise RequestError(
+                "--base-on-ground: there is no vehicle frame, because --mount is missing and --base-frame or --tf-static-topic is empty; "
+                "give --mount or both of them, or --camera-height-m",
+                field="base_on_ground",
+            )
+    return MountingRule(
+        mount=mount,
+        base_frame=base_frame,
+        ground_frame=ground_frame,
+        camera_height=height,
+        height_std_m=over_ground_std_m,
+    )
 
 
 @contextmanager

@@ -1,6 +1,7 @@
 """Match RGB images, depth images and calibrations by time stamp. The three streams may arrive in any order."""
 
 from collections import OrderedDict
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -90,15 +91,31 @@ class Pairs:
         while len(self._infos) > self.most:
             self._infos.popitem(last=False)
 
-    def oldest(self) -> Pair | None:
-        """Take the oldest complete pair and drop older images; None if there is no pair."""
-        found = self._matches()
+    def oldest(self, is_ready: Callable[[int], bool] = lambda _: True) -> Pair | None:
+        """Take the oldest complete pair and drop older images; None if there is no pair.
+
+        Args:
+            is_ready: whether a pair may be taken, by the stamp of its RGB image in ns.
+        """
+        found = self._matches(is_ready)
         return self._take(min(found)) if found else None
 
-    def newest(self) -> Pair | None:
-        """Take the newest complete pair and drop older images; None if there is no pair."""
-        found = self._matches()
+    def newest(self, is_ready: Callable[[int], bool] = lambda _: True) -> Pair | None:
+        """Take the newest complete pair and drop older images; None if there is no pair.
+
+        Args:
+            is_ready: whether a pair may be taken, by the stamp of its RGB image in ns.
+        """
+        found = self._matches(is_ready)
         return self._take(max(found)) if found else None
+
+    def has_pair(self) -> bool:
+        """Return whether a complete pair waits."""
+        return bool(self._matches(lambda _: True))
+
+    def camera_frame(self) -> str | None:
+        """Return the frame of the newest waiting RGB image; None if there is none."""
+        return str(self._colors[max(self._colors)].header.frame_id) if self._colors else None
 
     @property
     def waiting(self) -> int:
@@ -118,7 +135,7 @@ class Pairs:
             waiting.popitem(last=False)
             self.dropped += 1
 
-    def _matches(self) -> list[tuple[int, int]]:
+    def _matches(self, is_ready: Callable[[int], bool]) -> list[tuple[int, int]]:
         """Return stamps of RGB and depth images that are mutually nearest and within the tolerance."""
         if not (self._colors and self._depths and self._infos):
             return []
@@ -126,7 +143,7 @@ class Pairs:
         return [
             (color, depth)
             for color, depth in nearest.items()
-            if abs(color - depth) <= self._tolerance_ns and _nearest(self._colors, depth) == color
+            if abs(color - depth) <= self._tolerance_ns and _nearest(self._colors, depth) == color and is_ready(color)
         ]
 
     def _take(self, stamps: tuple[int, int]) -> Pair:

@@ -18,7 +18,7 @@ from service.geometry.rigid import (
     transform_from,
 )
 from service.imaging.level import GivenHeight
-from service.option_limits import HEIGHT_STD_M, LEAST_HEIGHT_M, MOST_HEIGHT_M, VEHICLE_HEIGHT_STD_M
+from service.option_limits import HEIGHT_STD_M, LEAST_HEIGHT_M, MOST_HEIGHT_M
 
 Covariance = Float64[NDArray[np.float64], "6 6"]
 
@@ -112,39 +112,42 @@ def mount_from(text: str) -> Transform:
     return transform_from(rotation_from_quaternion_xyzw(np.array(numbers[3:])), np.array(numbers[:3]))
 
 
-def height_from(
-    camera_height_m: float, T_vehicle_camera: Transform | None, *, base_on_ground: bool
-) -> GivenHeight | None:
-    """Return the height of the camera above the ground; None if it shall be found in the depth image.
+def measured_height(camera_height_m: float, std_m: float = 0.0) -> GivenHeight | None:
+    """Return the height of the camera above the ground as somebody measured it; None if nobody did.
 
     Args:
-        camera_height_m: measured height, metres; it goes before the height of the mounting. 0 if none was measured.
-        T_vehicle_camera: mounting, from the camera frame to the vehicle frame, metres; None if it is unknown.
-        base_on_ground: whether the origin of the vehicle frame lies on the ground (z up), as that of base_footprint (REP 105).
+        camera_height_m: height, metres; 0 if it was not measured.
+        std_m: its standard deviation, metres; 0 for the usual one.
 
     Raises:
-        RequestError: the height is out of bounds, or ``base_on_ground`` is true without a mounting.
+        RequestError: the height is out of bounds.
     """
-    if camera_height_m:
-        if not LEAST_HEIGHT_M <= camera_height_m <= MOST_HEIGHT_M:
-            raise RequestError(
-                f"--camera-height-m: {camera_height_m:g} m is not a valid camera height; give {LEAST_HEIGHT_M:g} to {MOST_HEIGHT_M:g} m, "
-                "or 0 to find it in the depth image",
-                field="camera_height_m",
-            )
-        return GivenHeight(camera_height_m, HEIGHT_STD_M)
-    if not base_on_ground:
+    if not camera_height_m:
         return None
-    if T_vehicle_camera is None:
+    if not LEAST_HEIGHT_M <= camera_height_m <= MOST_HEIGHT_M:
         raise RequestError(
-            "--base-on-ground: --mount is missing, and the camera height follows from it; give --mount, or --camera-height-m",
-            field="base_on_ground",
+            f"--camera-height-m: {camera_height_m:g} m is not a valid camera height; give {LEAST_HEIGHT_M:g} to {MOST_HEIGHT_M:g} m, "
+            "or 0 to take it from TF or the depth image",
+            field="camera_height_m",
         )
-    height_m = float(T_vehicle_camera[2, 3])
+    return GivenHeight(camera_height_m, std_m or HEIGHT_STD_M)
+
+
+def height_on_mount(mount: Transform, std_m: float) -> GivenHeight:
+    """Return the height of the camera above the origin of its mounting, which lies on the ground.
+
+    Args:
+        mount: from the camera frame to the vehicle frame (z up), metres.
+        std_m: standard deviation of the height, metres.
+
+    Raises:
+        RequestError: the height is out of bounds.
+    """
+    height_m = float(mount[2, 3])
     if not LEAST_HEIGHT_M <= height_m <= MOST_HEIGHT_M:
         raise RequestError(
             f"--mount: with --base-on-ground, its Z of {height_m:g} m is the camera height, which must be {LEAST_HEIGHT_M:g} to "
             f"{MOST_HEIGHT_M:g} m; give the mounting on base_footprint, or --camera-height-m without --base-on-ground",
             field="mount",
         )
-    return GivenHeight(height_m, VEHICLE_HEIGHT_STD_M)
+    return GivenHeight(height_m, std_m)

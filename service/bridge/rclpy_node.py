@@ -6,7 +6,7 @@ from importlib import import_module
 from threading import Event
 from typing import Any
 
-from service.bridge.bridge import Bridge, Published
+from service.bridge.bridge import DELIVERIES, Bridge, Delivery, Published
 from service.bridge.diagnostics import NAME, Diagnosis
 from service.bridge.pose import StampedPose
 from service.errors import ExtraMissingError
@@ -36,7 +36,8 @@ def ros_node(*, args: list[str] | None = None, domain: int | None = None) -> Ite
         import rclpy
         from rclpy.signals import SignalHandlerOptions
 
-        for messages in ("diagnostic_msgs.msg", "geometry_msgs.msg", "sensor_msgs.msg"):  # of `spin`
+        packages = ("diagnostic_msgs.msg", "geometry_msgs.msg", "nav_msgs.msg", "sensor_msgs.msg", "tf2_msgs.msg")
+        for messages in packages:  # of `spin`
             import_module(messages)
     except ModuleNotFoundError as error:
         raise ExtraMissingError(
@@ -103,18 +104,31 @@ def spin(
     import rclpy
     from diagnostic_msgs.msg import DiagnosticArray
     from geometry_msgs.msg import PoseWithCovarianceStamped
-    from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
-    from sensor_msgs.msg import CameraInfo, Image
+    from nav_msgs.msg import Odometry
+    from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
+    from sensor_msgs.msg import CameraInfo, Image, Imu
+    from tf2_msgs.msg import TFMessage
 
-    pictures = QoSProfile(
-        depth=depth or 1000,
-        history=HistoryPolicy.KEEP_LAST if depth else HistoryPolicy.KEEP_ALL,
-        reliability=ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT,
-    )
     topics = bridge.topics
-    kinds = {"color": Image, "depth": Image, "info": CameraInfo, "right_info": CameraInfo}
+    kinds = {
+        "color": Image,
+        "depth": Image,
+        "info": CameraInfo,
+        "right_info": CameraInfo,
+        "tf_static": TFMessage,
+        "odom": Odometry,
+        "imu": Imu,
+        "prior": PoseWithCovarianceStamped,
+    }
     for name, handler in bridge.handlers().items():
-        node.create_subscription(kinds[name], getattr(topics, name), handler, pictures)
+        how = DELIVERIES.get(name, Delivery(depth, reliable))
+        quality = QoSProfile(
+            depth=how.depth or 1000,
+            history=HistoryPolicy.KEEP_LAST if how.depth else HistoryPolicy.KEEP_ALL,
+            reliability=ReliabilityPolicy.RELIABLE if how.reliable else ReliabilityPolicy.BEST_EFFORT,
+            durability=DurabilityPolicy.TRANSIENT_LOCAL if how.latched else DurabilityPolicy.VOLATILE,
+        )
+        node.create_subscription(kinds[name], getattr(topics, name), handler, quality)
     poses = node.create_publisher(PoseWithCovarianceStamped, topics.pose, 10)
     diagnoses = node.create_publisher(DiagnosticArray, topics.diagnostics, 10)
     spoken_s = bridge.clock()

@@ -1,7 +1,7 @@
 """The bridge over DDS, the protocol of ROS 2. This side needs no ROS installation."""
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from threading import Event
 from typing import TypeVar
 
@@ -14,7 +14,7 @@ from cyclonedds.topic import Topic
 from cyclonedds.util import duration
 
 from service.bridge import messages
-from service.bridge.bridge import IDLE_S, Bridge, Published
+from service.bridge.bridge import DELIVERIES, IDLE_S, Bridge, Published
 from service.bridge.diagnostics import NAME, Diagnosis
 from service.bridge.pose import StampedPose
 from service.errors import AddressError
@@ -29,22 +29,30 @@ _KINDS: dict[str, type[IdlStruct]] = {
     "depth": messages.Image,
     "info": messages.CameraInfo,
     "right_info": messages.CameraInfo,
+    "tf_static": messages.TFMessage,
+    "odom": messages.Odometry,
+    "imu": messages.Imu,
+    "prior": messages.PoseWithCovarianceStamped,
 }
+#: Number of messages that are taken from a reader at once.
+_AT_ONCE = 100
 #: Data representation of ROS 2 on the wire.
 _CDR = Policy.DataRepresentation(use_cdrv0_representation=True)
 
 
-def qos_of(*, reliable: bool, depth: int) -> Qos:
+def qos_of(*, reliable: bool, depth: int, latched: bool = False) -> Qos:
     """Build the quality of service of ROS 2.
 
     Args:
         reliable: send lost messages again. A best-effort reader also receives from reliable writers. A reliable reader does not
             receive from best-effort writers.
         depth: length of the message queue; 0 keeps all.
+        latched: a late reader also gets the messages that a writer sent before (transient local).
     """
     history = Policy.History.KeepLast(depth) if depth else Policy.History.KeepAll
     reliability = Policy.Reliability.Reliable(duration(seconds=10)) if reliable else Policy.Reliability.BestEffort
-    return Qos(reliability, history, Policy.Durability.Volatile, _CDR)
+    durability = Policy.Durability.TransientLocal if latched else Policy.Durability.Volatile
+    return Qos(reliability, history, durability, _CDR)
 
 
 def dds_name(topic: str) -> str:
@@ -75,8 +83,13 @@ class DdsNode:
         try:
             self._participant = DomainParticipant(domain)
             pictures = qos_of(reliable=reliable, depth=depth)
+            others = {
+                name: qos_of(reliable=each.reliable, depth=each.depth, latched=each.latched)
+                for name, each in DELIVERIES.items()
+            }
             self._readers = {
-                name: self._reader(getattr(topics, name), _KINDS[name], pictures) for name in bridge.handlers()
+                name: self._reader(getattr(topics, name), _KINDS[name], others.get(name, pictures))
+                for name in bridge.handlers()
             }
             self._pose = self._writer(topics.pose, messages.PoseWithCovarianceStamped)
             self._diagnostics = self._writer(topics.diagnostics, messages.DiagnosticArray)
@@ -99,11 +112,12 @@ class DdsNode:
         """
         spoken_s = time.monotonic() - IDLE_S
         while not over.is_set():
-            if (wait_s := self._bridge.wait_s()) > 0:  # no query is due, so messages need not be unpacked
+            if (wait_s := self._bridge.wait_s()) > 0:  # no query is due, so images need not be unpacked
+                self._take(DELIVERIES.keys())
                 over.wait(min(wait_s, _LOOK_S))
             else:
                 self._waiting.wait(duration(seconds=_LOOK_S))
-                self._take()
+                self._take(self._readers.keys())
                 while not over.is_set() and (published := self._bridge.step()) is not None:
                     self._publish(published)
                     callback(published)
@@ -112,11 +126,21 @@ class DdsNode:
                 self._say(self._bridge.idle())
                 spoken_s = time.monotonic()
 
-    def _take(self) -> None:
+    def _take(self, names: Collection[str]) -> None:
+        """Hand the messages of some topics to the bridge: of images the first few, of other topics all.
+
+        The other topics come last, so the odometry from before an image is there with the image.
+        """
         handlers = self._bridge.handlers()
         for name, reader in self._readers.items():
-            for message in reader.take(N=self._bridge.pairs.most):
-                handlers[name](message)
+            if name not in names:
+                continue
+            at_once = _AT_ONCE if name in DELIVERIES else self._bridge.pairs.most
+            while received := reader.take(N=at_once):
+                for message in received:
+                    handlers[name](message)
+                if name not in DELIVERIES or len(received) < at_once:
+                    break
 
     def _publish(self, published: Published) -> None:
         if published.pose is not None:

@@ -4,10 +4,12 @@ import os
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Annotated, Any, get_type_hints
+from typing import Annotated, Any, Literal, get_type_hints
 
 #: Types of ROS parameters that the bridge has.
 Parameter = str | float | int | bool
+#: Where the direction of gravity in the camera frame comes from.
+GravitySource = Literal["mounting", "imu", "none"]
 #: Settings that are files or folders.
 _PATHS = frozenset({"map", "ca", "cert", "key"})
 
@@ -31,8 +33,17 @@ class BridgeSettings:
         diagnostics_topic: see ``Topics``.
         frame: of the poses.
         mount: see ``mount_from``.
-        base_on_ground: see ``height_from``.
-        camera_height_m: see ``height_from``.
+        tf_static_topic: see ``Topics``.
+        base_frame: see ``MountingRule``.
+        ground_frame: see ``MountingRule``.
+        base_on_ground: ``base_frame`` or the frame of ``mount`` is a ``ground_frame``.
+        camera_height_m: see ``measured_height``.
+        camera_height_std_m: standard deviation of the height, metres; 0 for the usual one.
+        gravity: see ``Robot``.
+        imu_topic: see ``Topics``.
+        odom_topic: see ``Topics``.
+        prior_topic: see ``Topics``.
+        prior_age: see ``InitialPoses``, seconds.
         rectified: see ``camera_from``.
         baseline_m: see ``StereoRig``, metres.
         right_info_topic: see ``StereoRig``.
@@ -62,18 +73,53 @@ class BridgeSettings:
     frame: Annotated[str, "frame_id of the poses."] = "map"
     mount: Annotated[
         str | None,
-        "Camera pose on the vehicle, X,Y,Z,QX,QY,QZ,QW as tf2_echo base_link OPTICAL_FRAME prints it. The bridge then "
-        "publishes the vehicle's pose. Otherwise it publishes the camera's pose as a body (x forward, z up).",
+        "Camera pose on the vehicle, X,Y,Z,QX,QY,QZ,QW as tf2_echo base_link OPTICAL_FRAME prints it. It replaces the transform from "
+        "TF to --base-frame.",
     ] = None
+    tf_static_topic: Annotated[
+        str, "tf2_msgs/TFMessage, the fixed transforms of the robot. Empty: the bridge reads no TF."
+    ] = "/tf_static"
+    base_frame: Annotated[
+        str,
+        "Vehicle frame in TF. The bridge publishes the pose of this frame. If TF does not have it after 5 seconds, or if it is empty, "
+        "the bridge publishes the camera's pose as a body (x forward, z up).",
+    ] = "base_link"
+    ground_frame: Annotated[
+        str,
+        "Frame in TF that lies on the ground under the vehicle, with its z axis up. The z of the camera in this frame is the camera's "
+        "height. Empty, or not in TF: the depth image gives the height.",
+    ] = "base_footprint"
     base_on_ground: Annotated[
-        bool,
-        "The frame of --mount lies on the ground and its z axis points up, as base_footprint. The camera's height is then the Z of "
-        "--mount.",
+        bool, "The frame of --mount, or else --base-frame, lies on the ground. It replaces --ground-frame."
     ] = False
     camera_height_m: Annotated[
         float,
-        "Height of the camera above the ground, metres. 0: from --base-on-ground, otherwise from the depth image.",
+        "Height of the camera above the ground, metres. It goes before --ground-frame and --base-on-ground. 0: they give the height, or "
+        "else the depth image does.",
     ] = 0.0
+    camera_height_std_m: Annotated[
+        float,
+        "Standard deviation of the camera's height, metres. 0: 0.05 with --camera-height-m, 0.1 with a height from TF or --mount.",
+    ] = 0.0
+    gravity: Annotated[
+        GravitySource,
+        "Where the downward direction in the camera frame comes from. mounting: TF or --mount, if the camera is tilted by more than 2 "
+        "degrees. imu: the orientation on --imu-topic. none: the service finds the tilt in the depth image.",
+    ] = "mounting"
+    imu_topic: Annotated[str, "sensor_msgs/Imu with an orientation. The bridge reads it with --gravity imu only."] = (
+        "/imu/data"
+    )
+    odom_topic: Annotated[
+        str,
+        "nav_msgs/Odometry, in a frame that never jumps. The queries then form a track: more frames make an ambiguous answer certain. "
+        "Empty, or no messages: each query stands alone.",
+    ] = "/odom"
+    prior_topic: Annotated[
+        str,
+        "geometry_msgs/PoseWithCovarianceStamped of the vehicle in the frame of --frame. It is the prior of the next queries, until a "
+        "pose is published. Empty: there is no prior.",
+    ] = "/initialpose"
+    prior_age: Annotated[float, "Age after which the bridge drops a pose of --prior-topic, seconds."] = 30.0
     rectified: Annotated[
         bool,
         "The images are rectified, whatever lens the CameraInfo describes. A colour topic whose name says rect counts as rectified too. "

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from service.bridge.settings import BridgeSettings, about
+from service.bridge.settings import BridgeSettings, GravitySource, about
 from service.cli.tls_options import Ca, Cert, Key
 
 if TYPE_CHECKING:
@@ -42,10 +42,21 @@ def ros2(
     diagnostics_topic: Annotated[str, typer.Option(help=about("diagnostics_topic"))] = _DEFAULTS.diagnostics_topic,
     frame: Annotated[str, typer.Option(help=about("frame"))] = _DEFAULTS.frame,
     mount: Annotated[str | None, typer.Option(help=about("mount"), show_default=False)] = None,
+    tf_static_topic: Annotated[str, typer.Option(help=about("tf_static_topic"))] = _DEFAULTS.tf_static_topic,
+    base_frame: Annotated[str, typer.Option(help=about("base_frame"))] = _DEFAULTS.base_frame,
+    ground_frame: Annotated[str, typer.Option(help=about("ground_frame"))] = _DEFAULTS.ground_frame,
     base_on_ground: Annotated[
         bool, typer.Option("--base-on-ground", help=about("base_on_ground"))
     ] = _DEFAULTS.base_on_ground,
     camera_height_m: Annotated[float, typer.Option(help=about("camera_height_m"))] = _DEFAULTS.camera_height_m,
+    camera_height_std_m: Annotated[
+        float, typer.Option(help=about("camera_height_std_m"))
+    ] = _DEFAULTS.camera_height_std_m,
+    gravity: Annotated[GravitySource, typer.Option(help=about("gravity"))] = _DEFAULTS.gravity,
+    imu_topic: Annotated[str, typer.Option(help=about("imu_topic"))] = _DEFAULTS.imu_topic,
+    odom_topic: Annotated[str, typer.Option(help=about("odom_topic"))] = _DEFAULTS.odom_topic,
+    prior_topic: Annotated[str, typer.Option(help=about("prior_topic"))] = _DEFAULTS.prior_topic,
+    prior_age: Annotated[float, typer.Option(help=about("prior_age"))] = _DEFAULTS.prior_age,
     rectified: Annotated[bool, typer.Option("--rectified", help=about("rectified"))] = _DEFAULTS.rectified,
     baseline_m: Annotated[float, typer.Option(help=about("baseline_m"))] = _DEFAULTS.baseline_m,
     right_info_topic: Annotated[str | None, typer.Option(help=about("right_info_topic"), show_default=False)] = None,
@@ -66,7 +77,7 @@ def ros2(
 
     \b
     Example:
-      streetfix bridge ros2 --url http://127.0.0.1:8000 --mount 0.2,0,0.5,-0.5,0.5,-0.5,0.5 --rate 0.5
+      streetfix bridge ros2 --url http://127.0.0.1:8000 --base-frame base_footprint --rate 0.5
     """
     settings = BridgeSettings(
         url=url,
@@ -83,8 +94,17 @@ def ros2(
         diagnostics_topic=diagnostics_topic,
         frame=frame,
         mount=mount,
+        tf_static_topic=tf_static_topic,
+        base_frame=base_frame,
+        ground_frame=ground_frame,
         base_on_ground=base_on_ground,
         camera_height_m=camera_height_m,
+        camera_height_std_m=camera_height_std_m,
+        gravity=gravity,
+        imu_topic=imu_topic,
+        odom_topic=odom_topic,
+        prior_topic=prior_topic,
+        prior_age=prior_age,
         rectified=rectified,
         baseline_m=baseline_m,
         right_info_topic=right_info_topic,
@@ -120,4 +140,6 @@ def _node_of(node: str, *, domain: int, reliable: bool, depth: int) -> "Callable
 def _tell(published: "Published") -> None:
     from service.bridge.bridge import line_of
 
+    for warning in published.warnings:
+        typer.echo(f"streetfix: warning: {warning}", err=True)
     typer.echo(line_of(published))

@@ -11,8 +11,9 @@ import httpx
 import numpy as np
 import pytest
 
+from service.bridge.asking import AskService
+from service.bridge.known import Known, Motion
 from service.client import Client, GrpcClient, OdometryStd, PinholeCamera, RefusedError, RequestError, Track
-from service.confidence.features import FEATURES
 from service.contract.schema import MOST_TOKEN
 from service.grpc.generated.streetfix.v1 import localization_pb2 as pb
 from service.grpc.generated.streetfix.v1.localization_pb2_grpc import LocalizationServiceStub
@@ -32,30 +33,16 @@ T_STEP = np.array([[1.0, 0, 0, 0], [0, 1.0, 0, 0], [0, 0, 1.0, 1.0], [0, 0, 0, 1
 RIGHT, KNOWN, THRESHOLD = 0.8, 0.95, 0.9
 
 
-def log_odds(probability: float) -> float:
-    return float(np.log(probability / (1 - probability)))
-
-
-def calibration() -> dict[str, Any]:
-    """A calibration with one confidence for all answers, and no evidence out of range."""
-    return {
-        "calibrated": True,
-        "features": [{"name": name, "mean": 0.0, "std": 1e6} for name in FEATURES],
-        "right": {"terms": [], "bias": log_odds(RIGHT)},
-        "known": {"terms": [], "bias": log_odds(KNOWN)},
-        "thresholds": [{"false_accept_rate": 0.01, "confidence": THRESHOLD}],
-        "site": None,
-        "measured_on": {"cities": "none", "queries": 0},
-    }
-
-
 @pytest.fixture(scope="module")
 def faces(
-    content_of: Callable[..., BundleContent], tmp_path_factory: pytest.TempPathFactory, serving: Any
+    content_of: Callable[..., BundleContent],
+    constant_calibration: Callable[..., dict[str, Any]],
+    tmp_path_factory: pytest.TempPathFactory,
+    serving: Any,
 ) -> Iterator[tuple[httpx.Client, LocalizationServiceStub, str]]:
     """REST, gRPC, and the address of gRPC, on one engine."""
     folder: Path = tmp_path_factory.mktemp("tracks") / "tiny"
-    write_bundle(folder, content_of(calibration=calibration()))
+    write_bundle(folder, content_of(calibration=constant_calibration(right=RIGHT, known=KNOWN, threshold=THRESHOLD)))
     with serving(folder) as both:
         yield both
 
@@ -87,6 +74,25 @@ def test_frames_that_agree_become_localized(faces: Any, parts_of: Parts) -> None
     assert second["belief"]["modes"][0]["number"] == belief["modes"][0]["number"]
     assert second["pose"]["position"] == second["hypotheses"][0]["pose"]["position"]
     assert (second["spread"], second["hypotheses"][0]["confirmed"]) == (None, True)
+
+
+def test_the_ros_bridge_carries_the_belief(faces: Any, pictures: Any) -> None:
+    client, _, _ = faces
+    with Client(str(client.base_url)) as rest:
+        ask = AskService(rest)
+        first = ask(*(*pictures, Known(motion=Motion())))
+        second = ask(*(*pictures, Known(motion=Motion(T_STEP))))
+        begun = ask(*(*pictures, Known(motion=Motion())))
+        alone = ask(*(*pictures, Known()))
+    assert [answer.status for answer in (first, second, begun, alone)] == [
+        "AMBIGUOUS",
+        "LOCALIZED",
+        "AMBIGUOUS",
+        "AMBIGUOUS",
+    ]
+    assert first.belief is not None
+    assert begun.belief is not None
+    assert (first.belief.epoch, begun.belief.epoch, alone.belief) == (0, 1, None)
 
 
 def test_a_robot_that_stands_still_is_not_localized_by_repetition(faces: Any, parts_of: Parts) -> None:

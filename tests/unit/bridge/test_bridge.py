@@ -6,6 +6,11 @@ import pytest
 
 from service.bridge.bridge import IDLE_S, Bridge, Topics, line_of
 from service.bridge.diagnostics import Level
+from service.bridge.initial_pose import InitialPoses
+from service.bridge.mounting import MountingRule
+from service.bridge.notices import Notices
+from service.bridge.odometry import Odometry
+from service.bridge.pose import CAMERA_AS_BODY
 from service.bridge.publish_policy import PublishPolicy
 from service.bridge.rig import StereoRig
 from service.bridge.robot import Robot as OfRobot
@@ -75,7 +80,12 @@ def test_diagnoses_carry_what_an_operator_looks_for(robot: Robot) -> None:
         "map": "tiny@abc",
         "camera_height": "0.31 m, given",
         "calibration": "unknown",
+        "belief": "none",
         "latency_ms": "500",
+        "pose_of": "camera",
+        "gravity": "none",
+        "prior": "none",
+        "track": "none",
         "queries": "1",
         "answered": "1",
         "published": "1",
@@ -190,6 +200,116 @@ def test_no_query_is_sent_before_the_right_cameras_calibration_is_there(robot: R
     assert known.baseline_m == 0.12
 
 
+def test_the_first_pairs_wait_for_the_mounting_in_tf(robot: Robot, fixed_of: Make) -> None:
+    """The camera is at (10, 20, 1.5) and looks along x, 0.5 m ahead of base_link and 0.4 m above it."""
+    bridge = robot.bridge(
+        topics=Topics(tf_static="/tf_static"), robot=OfRobot(rule=MountingRule(base_frame="base_link"))
+    )
+    robot.see(bridge, 1 * S)
+    assert bridge.step() is None
+    assert bridge.idle().message == "waiting for the mounting of the camera 'optical' on /tf_static"
+    bridge.handlers()["tf_static"](fixed_of(("base_link", "optical", (0.5, 0.0, 0.4, -0.5, 0.5, -0.5, 0.5))))
+    published = bridge.step()
+    assert published is not None
+    assert published.pose is not None
+    np.testing.assert_allclose(published.pose.T_map_vehicle[:3, 3], [9.5, 20.0, 1.1])
+    assert (dict(published.diagnosis.values)["pose_of"], published.warnings) == ("base_link", ())
+
+
+def test_without_a_mounting_in_tf_the_pose_is_that_of_the_camera_and_the_operator_is_told(
+    robot: Robot, fixed_of: Make
+) -> None:
+    bridge = robot.bridge(policy=PublishPolicy(rate_hz=0.0), robot=OfRobot(rule=MountingRule(base_frame="base_link")))
+    robot.see(bridge, 1 * S)
+    assert bridge.step() is None
+    robot.now_s += 5.0
+    first = bridge.step()
+    robot.see(bridge, 2 * S)
+    second = bridge.step()
+    assert first is not None
+    assert second is not None
+    assert second.pose is not None
+    np.testing.assert_allclose(second.pose.T_map_vehicle[:3, 3], [10.0, 20.0, 1.5])
+    (told,) = first.warnings
+    assert "so the published pose is that of the camera" in told
+    assert second.warnings == ()
+    bridge.robot.frames.add(fixed_of(("base_link", "optical", (0.5, 0.0, 0.4, -0.5, 0.5, -0.5, 0.5))))
+    robot.see(bridge, 3 * S)
+    late = bridge.step()
+    assert late is not None
+    assert late.pose is not None
+    np.testing.assert_allclose(late.pose.T_map_vehicle[:3, 3], [9.5, 20.0, 1.1])
+
+
+def odometry_robot(**changed: Any) -> OfRobot:
+    notices = Notices()
+    return OfRobot(
+        rule=MountingRule(mount=CAMERA_AS_BODY), odometry=Odometry("/odom", notices), notices=notices, **changed
+    )
+
+
+@pytest.mark.parametrize("rate_hz", [0.0, 1.0])
+def test_a_pair_waits_for_its_odometry_half_a_second(robot: Robot, odometry_of: Make, rate_hz: float) -> None:
+    bridge = robot.bridge(policy=PublishPolicy(rate_hz=rate_hz), topics=Topics(odom="/odom"), robot=odometry_robot())
+    bridge.handlers()["odom"](odometry_of(1 * S, 0.0, 0.0))
+    robot.see(bridge, 1 * S + 10 * MS)
+    assert bridge.step() is None
+    bridge.handlers()["odom"](odometry_of(1 * S + 20 * MS, 0.0, 0.0))
+    with_odometry = bridge.step()
+    robot.now_s += 1.0
+    robot.see(bridge, 2 * S)
+    assert bridge.step() is None
+    robot.now_s += 0.4
+    assert bridge.step() is None
+    robot.now_s += 0.2
+    without = bridge.step()
+    robot.now_s += 1.0
+    robot.see(bridge, 3 * S)  # the odometry has ended, so this pair does not wait
+    at_once = bridge.step()
+    told = []
+    for published in (with_odometry, without, at_once):
+        assert published is not None
+        told.append((published.diagnosis.stamp_ns, dict(published.diagnosis.values)["track"]))
+    assert told == [(1 * S + 10 * MS, "begins"), (2 * S, "none"), (3 * S, "none")]
+
+
+def test_with_a_rate_limit_the_newest_pair_that_has_its_odometry_is_sent(robot: Robot, odometry_of: Make) -> None:
+    bridge = robot.bridge(topics=Topics(odom="/odom"), robot=odometry_robot())
+    for stamp_ns in (1 * S, 1 * S + 100 * MS):
+        bridge.handlers()["odom"](odometry_of(stamp_ns, 0.0, 0.0))
+    for stamp_ns in (1 * S + 20 * MS, 1 * S + 60 * MS, 1 * S + 110 * MS):
+        robot.see(bridge, stamp_ns)
+    published = bridge.step()
+    assert published is not None
+    assert published.diagnosis.stamp_ns == 1 * S + 60 * MS
+
+
+def test_a_pose_of_an_operator_is_the_prior_until_an_answer_is_published(
+    robot: Robot, answer_of: Answer, initial_pose_of: Make
+) -> None:
+    """The bridge publishes on the topic that it reads. Its own pose is no prior."""
+    notices = Notices()
+    poses = InitialPoses("/initialpose", "map", 30.0, notices)
+    bridge = robot.bridge(
+        policy=PublishPolicy(rate_hz=0.0, min_confidence=0.9),
+        topics=Topics(prior="/initialpose"),
+        robot=OfRobot(initial_poses=poses, notices=notices),
+    )
+    bridge.handlers()["prior"](initial_pose_of(1.0, 2.0))
+    priors = []
+    for second, confidence in enumerate([0.5, 0.95, 0.95], start=1):
+        robot.answer = answer_of(confidence=confidence)
+        robot.see(bridge, second * S)
+        published = bridge.step()
+        assert published is not None
+        if published.pose is not None:
+            x, y, _ = published.pose.T_map_vehicle[:3, 3]
+            bridge.handlers()["prior"](initial_pose_of(x, y, stamp_ns=published.pose.stamp_ns))
+        *_, known = robot.asked[-1]
+        priors.append(None if known.prior is None else known.prior.position_m.tolist())
+    assert priors == [[1.0, 2.0], [1.0, 2.0], None]
+
+
 def test_a_calibration_that_is_not_of_a_right_camera_is_reported(robot: Robot, info_of: Make) -> None:
     bridge = robot.bridge(topics=Topics(right_info="/right"), robot=OfRobot(rig=StereoRig(topic="/right")))
     robot.see(bridge, 1 * S)
@@ -202,6 +322,12 @@ def test_a_calibration_that_is_not_of_a_right_camera_is_reported(robot: Robot, i
 
 def test_only_topics_with_a_name_have_a_handler(robot: Robot) -> None:
     assert list(robot.bridge().handlers()) == ["color", "depth", "info"]
+    every = Topics(right_info="/r", tf_static="/t", odom="/o")
+    assert list(robot.bridge(topics=every, robot=odometry_robot()).handlers())[3:] == [
+        "right_info",
+        "tf_static",
+        "odom",
+    ]
 
 
 def test_lines_for_people(robot: Robot, answer_of: Answer) -> None:

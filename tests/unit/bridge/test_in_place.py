@@ -2,6 +2,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from service.bridge.in_place import InPlace
@@ -9,6 +10,7 @@ from service.bridge.known import Known
 from service.errors import RequestError
 from service.geometry.camera import PinholeCamera
 from service.imaging.level import GivenHeight
+from service.retrieval.prior import Prior
 from service.retrieval.query import Query
 
 
@@ -35,6 +37,24 @@ def test_a_camera_height_that_is_given_counts_without_a_service_too(bundle_path:
         answer = InPlace(bundle_path)(*(*pictures, Known(camera_height=given)))
         assert answer.camera_height is not None
         assert (answer.camera_height.origin, round(answer.camera_height.height_m, 1)) == (origin, 1.5)
+
+
+def test_gravity_and_prior_reach_the_query_without_a_service_too(
+    bundle_path: Path, pictures: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked = list[Query]()
+    localize = InPlace(bundle_path)
+    answered = localize._localizer.localize
+
+    def keep(query: Query) -> Any:
+        asked.append(query)
+        return answered(query)
+
+    monkeypatch.setattr(localize._localizer, "localize", keep)
+    known = Known(down_camera=np.array([0.0, 1.0, 0.0]), prior=Prior(position_m=np.array([20.0, 100.0])))
+    localize(*(*pictures, known))
+    (query,) = asked
+    assert (query.down_camera is known.down_camera, query.prior is known.prior) == (True, True)
 
 
 def test_a_lens_is_rectified_without_a_service_too(bundle_path: Path, pictures: Any, pictures_through: Any) -> None:

@@ -33,6 +33,35 @@ MADE: list[Any] = [
         2,
         messages.RegionOfInterest(1, 2, 3, 4, True),
     ),
+    messages.TFMessage(
+        [
+            messages.TransformStamped(
+                HEADER,
+                "optical",
+                messages.Transform(messages.Vector3(1, 2, 3), messages.Quaternion(0.5, -0.5, 0.5, -0.5)),
+            ),
+            messages.TransformStamped(),
+        ]
+    ),
+    messages.Odometry(
+        HEADER,
+        "base_link",
+        messages.PoseWithCovariance(
+            messages.Pose(messages.Point(1, 2, 3), messages.Quaternion(4, 5, 6, 7)), list(range(36))
+        ),
+        messages.TwistWithCovariance(
+            messages.Twist(messages.Vector3(1, 2, 3), messages.Vector3(4, 5, 6)), list(range(36, 72))
+        ),
+    ),
+    messages.Imu(
+        HEADER,
+        messages.Quaternion(1, 2, 3, 4),
+        list(range(9)),
+        messages.Vector3(5, 6, 7),
+        list(range(9, 18)),
+        messages.Vector3(8, 9, 10),
+        list(range(18, 27)),
+    ),
     pose_message(POSE),
     diagnostics_message(TOLD),
 ]
@@ -113,3 +142,8 @@ def test_qualities_of_service_are_written_as_ros_speaks(reliable: bool, depth: i
     assert ("Reliable" in told) == reliable
     assert ("KeepAll" in told) == (depth == 0)
     assert "use_cdrv0_representation=True" in told
+    assert "Volatile" in told
+
+
+def test_a_latched_topic_also_gives_earlier_messages() -> None:
+    assert "TransientLocal" in str(qos_of(reliable=True, depth=0, latched=True))

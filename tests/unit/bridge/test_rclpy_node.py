@@ -8,8 +8,13 @@ import numpy as np
 import pytest
 
 from service.bridge import rclpy_node
-from service.bridge.bridge import Bridge, Published
+from service.bridge.bridge import Bridge, Published, Topics
+from service.bridge.gravity import Imu
+from service.bridge.initial_pose import InitialPoses
+from service.bridge.notices import Notices
+from service.bridge.odometry import Odometry
 from service.bridge.publish_policy import PublishPolicy
+from service.bridge.robot import Robot
 from service.contract.schema import LocalizeAnswer
 from service.errors import ExtraMissingError
 
@@ -50,6 +55,31 @@ def test_image_subscriptions_follow_the_settings(
     rclpy_node.run(Bridge(localize=lambda *_: pytest.fail("asked")), ros.over, reliable=reliable, depth=depth)
     for subscription in ros.subscriptions.values():
         assert (subscription.qos.reliability, subscription.qos.history, subscription.qos.depth) == wanted
+
+
+def test_other_topics_are_received_as_they_are_published(ros: Any) -> None:
+    notices = Notices()
+    robot = Robot(
+        odometry=Odometry("/odom", notices),
+        imu=Imu("/imu", notices),
+        initial_poses=InitialPoses("/initialpose", "map", 30.0, notices),
+    )
+    topics = Topics(tf_static="/tf_static", odom="/odom", imu="/imu", prior="/initialpose")
+    rclpy_node.run(
+        Bridge(localize=lambda *_: pytest.fail("asked"), topics=topics, robot=robot), ros.over, reliable=True
+    )
+    told = {}
+    for topic in ("/tf_static", "/odom", "/imu", "/initialpose"):
+        each = ros.subscriptions[topic]
+        kind = each.kind if isinstance(each.kind, str) else each.kind.__name__
+        told[topic] = (kind, each.qos.reliability, each.qos.durability, each.qos.history, each.qos.depth)
+    assert told == {
+        "/tf_static": ("TFMessage", "reliable", "latched", "all", 1000),
+        "/odom": ("Odometry", "best effort", "volatile", "last", 500),
+        "/imu": ("Imu", "best effort", "volatile", "last", 500),
+        "/initialpose": ("posed_message", "reliable", "volatile", "last", 10),
+    }
+    assert ros.subscriptions["/camera/color/image_raw"].qos.durability == "volatile"
 
 
 def test_silence_is_reported_once_per_second(ros: Any) -> None:

@@ -141,6 +141,8 @@ def test_the_node_answers_images_until_a_signal(
     image_of: Callable[..., Any],
     info_of: Callable[..., Any],
     answer_of: Callable[..., LocalizeAnswer],
+    odometry_of: Callable[..., Any],
+    initial_pose_of: Callable[..., Any],
 ) -> None:
     opened, asked = list[Path](), list[Known]()
 
@@ -167,6 +169,8 @@ def test_the_node_answers_images_until_a_signal(
     }
 
     def see() -> None:
+        ros.subscriptions["/odom"].heard(odometry_of(5 * S, 0.0, 0.0))
+        ros.subscriptions["/initialpose"].heard(initial_pose_of(0.0, 0.0, frame="odom"))
         ros.subscriptions["/camera/color/camera_info"].heard(info_of(0))
         ros.subscriptions["/right/camera_info"].heard(info_of(p=[400.0, 0, 0, -48.0, 0, 400.0, 0, 0, 0, 0, 1, 0]))
         color, depth = np.zeros((4, 6, 3), np.uint8), np.ones((4, 6), np.float32)
@@ -176,13 +180,18 @@ def test_the_node_answers_images_until_a_signal(
     ros.turns, ros.no_more = [see], lambda: signal.raise_signal(signal.SIGINT)
     assert node["main"](["--ros-args"]) == 0
     assert opened == [Path("maps/site")]
-    assert [(known.camera_height, known.baseline_m) for known in asked] == [(GivenHeight(0.3, 0.05), 0.12)]
+    (known,) = asked
+    assert (known.camera_height, known.baseline_m) == (GivenHeight(0.3, 0.05), 0.12)
+    assert known.motion is not None
     (pose,) = ros.published["/pose"]
     assert (pose.header.frame_id, pose.pose.pose.position.x) == ("earth", 10.0)
-    assert {(each.qos.reliability, each.qos.history) for each in ros.subscriptions.values()} == {("reliable", "all")}
-    (listening, line) = ros.logged
+    images = {each.qos.history for each in ros.subscriptions.values() if each.kind in ("Image", "CameraInfo")}
+    assert images == {"all"}
+    (listening, warning, line) = ros.logged
     assert listening[1].startswith("listening to /camera/color/image_raw and ")
     assert (line[0], line[1].partition("  ")[0]) == ("info", "5.000 LOCALIZED 0.950")
+    assert warning[0] == "warning"
+    assert warning[1].startswith("/initialpose: a pose has the frame 'odom'")
     assert (ros.args, ros.domain, ros.ended) == (["--ros-args"], None, ["node", "shutdown"])
 
 

@@ -23,6 +23,15 @@ def test_the_help_names_every_topic(capsys: pytest.CaptureFixture[str]) -> None:
         "--info-topic",
         "--pose-topic",
         "--mount",
+        "--tf-static-topic",
+        "--base-frame",
+        "--ground-frame",
+        "--camera-height-std-m",
+        "--gravity",
+        "--imu-topic",
+        "--odom-topic",
+        "--prior-topic",
+        "--prior-age",
         "--rate",
     ):
         assert option in out

@@ -1,4 +1,4 @@
-"""Start the bridge of Streetfix: ``ros2 launch streetfix_ros streetfix.launch.py mount:=0.2,0,0.5,-0.5,0.5,-0.5,0.5``.
+"""Start the bridge of Streetfix: ``ros2 launch streetfix_ros streetfix.launch.py base_frame:=base_footprint``.
 
 Parameters come from ``params_file``. Each parameter is also an argument, and an argument overrides the file.
 """

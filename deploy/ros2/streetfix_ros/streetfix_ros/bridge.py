@@ -1,11 +1,12 @@
 """The node of ``ros2 run streetfix_ros bridge``: ROS parameters in, the bridge of ``service.bridge`` started with them."""
 
 import sys
+from functools import partial
 from typing import Any
 
 from rcl_interfaces.msg import ParameterDescriptor
 
-from service.bridge.bridge import line_of
+from service.bridge.bridge import Published, line_of
 from service.bridge.opening import opened, until_signalled
 from service.bridge.rclpy_node import ros_node, spin
 from service.bridge.settings import BridgeSettings, about, parameters, settings_from
@@ -27,6 +28,18 @@ def declared(node: Any) -> BridgeSettings:
     return settings_from(values)
 
 
+def tell(log: Any, published: Published) -> None:
+    """Log the result of one image pair.
+
+    Args:
+        log: of the node.
+        published: the result.
+    """
+    for warning in published.warnings:
+        log.warning(warning)
+    log.info(line_of(published))
+
+
 def main(args: list[str] | None = None) -> int:
     """Run the node until SIGINT or SIGTERM, and return the exit status.
 
@@ -41,14 +54,7 @@ def main(args: list[str] | None = None) -> int:
                 log.info(
                     f"listening to {settings.color_topic} and {settings.depth_topic}, publishing {settings.pose_topic}"
                 )
-                spin(
-                    node,
-                    bridge,
-                    over,
-                    lambda published: log.info(line_of(published)),
-                    reliable=settings.reliable,
-                    depth=settings.queue,
-                )
+                spin(node, bridge, over, partial(tell, log), reliable=settings.reliable, depth=settings.queue)
         except StreetfixError as error:
             log.fatal(error.message)
             return 1
