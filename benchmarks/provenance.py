@@ -310,6 +310,17 @@ def _changed_files(commit: str, head: str) -> dict[str, tuple[str, str]] | None:
     }
 
 
+def changed_programs(commit: str, head: str = "HEAD") -> list[str] | None:
+    """Return the files that differ in more than comments, docstrings and layout; None if Git cannot tell.
+
+    Args:
+        commit: one commit.
+        head: the other commit.
+    """
+    changed = _changed_files(commit, head)
+    return None if changed is None else [file for file, objects in changed.items() if not _same_program(file, *objects)]
+
+
 @cache
 def _same_program(name: str, before: str, after: str) -> bool:
     """Return whether two versions of a file, named by their Git objects, are the same program."""

@@ -25,7 +25,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks import several_frames
-from benchmarks.provenance import CHECKS, ROOT, git, head_commit, is_dirty, machine
+from benchmarks.provenance import CHECKS, ROOT, changed_programs, git, head_commit, is_dirty, machine
 from benchmarks.real.streets import unpacked
 
 #: Beginnings of the ids of rows that a check covers, by report: answers on maps of one bundle.
@@ -213,7 +213,7 @@ def work_tree(commit: str, folder: Path) -> None:
     """
     if git("cat-file", "-e", f"{commit}^{{commit}}") is None:
         raise ValueError(f"--before: {commit} is not a commit of this repository")
-    changed = (git("diff", "--name-only", commit, "HEAD") or "").split()
+    changed = changed_programs(commit) or []
     if compiled := [name for name in changed if name.endswith((".c", ".h")) or name.startswith("native/")]:
         raise ValueError(f"--before: {compiled[0]} differs, and the check does not compile; measure the rows again")
     if git("worktree", "add", "--detach", str(folder), commit) is None:

@@ -81,6 +81,17 @@ def test_comments_docstrings_and_layout_count_only_for_rows_that_measure_text(re
     assert ages([before], commit("service/maps/a.py", "def a():\n    return 2\n"), "map") == [True]
 
 
+def test_a_comment_changes_no_program_and_a_statement_does(repository):
+    _, commit = repository
+    before = commit("service/maps/kernel.c", "int a = 1; // one\n")
+    commented = commit("service/maps/kernel.c", "int a = 1; /* 1 */\n")
+    assert provenance.changed_programs(before, commented) == []
+    assert provenance.changed_programs(before, commit("service/maps/kernel.c", "int a = 2;\n")) == [
+        "service/maps/kernel.c"
+    ]
+    assert provenance.changed_programs("f" * 40, commented) is None
+
+
 def test_a_new_or_missing_file_counts(repository):
     (_, _, third), commit = repository
     head = commit("service/maps/new.py", "")

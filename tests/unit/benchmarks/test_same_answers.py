@@ -94,8 +94,9 @@ def test_changes_that_are_not_committed_are_refused(monkeypatch, capsys):
 
 @pytest.mark.parametrize(("changed", "what"), [(None, "is not a commit"), ("native/build.ninja", "does not compile")])
 def test_an_unknown_commit_and_other_c_code_are_refused(monkeypatch, capsys, changed, what):
-    answers = {"rev-parse": "f" * 40, "cat-file": None if changed is None else "", "diff": changed, "worktree": ""}
+    answers = {"rev-parse": "f" * 40, "cat-file": None if changed is None else "", "worktree": ""}
     monkeypatch.setattr(same_answers, "is_dirty", lambda: False)
+    monkeypatch.setattr(same_answers, "changed_programs", lambda _: [changed])
     monkeypatch.setattr(same_answers, "git", lambda command, *_: answers[command])
     with pytest.raises(SystemExit):
         main(["--before", "HEAD"])
