@@ -19,7 +19,7 @@ from service.imaging.view_grid import ViewGrid
 from service.maps.calibration import Calibration
 from service.retrieval.hypotheses import ClusterSettings, Hypothesis
 from service.retrieval.knn import Neighbour
-from service.retrieval.retrieve import EncodedFrame
+from service.retrieval.retrieve import EncodedFrame, Retrieved
 from service.scoring.candidates import Candidate, Refined, distinct_candidates, log_shares, support_gaps
 
 #: A neighbour further than OTHER_PLACE_M from the answer is another place (feature ``similarity_margin``).
@@ -43,7 +43,7 @@ class Evidence:
         refined: registered candidates, the best supported first.
         neighbours: distinct places retrieved for the reference, the most similar first.
         hypotheses: clusters of the most similar views of the reference.
-        places_m: x and y of all places, map frame, metres.
+        places_xy: x of all places, then y of all places, map frame, metres.
         grid: view grid of the map.
     """
 
@@ -51,7 +51,7 @@ class Evidence:
     refined: Refined
     neighbours: tuple[Neighbour, ...]
     hypotheses: tuple[Hypothesis, ...]
-    places_m: Float64[NDArray[np.float64], "P 2"]
+    places_xy: Float64[NDArray[np.float64], "2 P"]
     grid: ViewGrid
 
     @property
@@ -137,7 +137,7 @@ class Evidence:
         Without this normalisation a sparse survey would get fewer votes (decision 0033).
         """
         xy = self.best.T_map_camera[:2, 3]
-        places = float(np.clip((np.hypot(*(self.places_m - xy).T) < VOTE_M).sum(), 1, VOTERS))
+        places = float(np.clip((np.hypot(*(self.places_xy - xy[:, np.newaxis])) < VOTE_M).sum(), 1, VOTERS))
         return float((self.away_m[:VOTERS] < VOTE_M).sum()) / places
 
     @property
@@ -272,9 +272,8 @@ def weighted_median(values: Float64[NDArray[np.float64], " n"], weights: Float64
 def evidence_of(
     frames: tuple[EncodedFrame, ...],
     refined: Refined,
-    neighbours: tuple[Neighbour, ...],
-    hypotheses: tuple[Hypothesis, ...],
-    places_m: Float64[NDArray[np.float64], "P 2"],
+    retrieved: Retrieved,
+    places_xy: Float64[NDArray[np.float64], "2 P"],
     grid: ViewGrid,
 ) -> Float64[NDArray[np.float64], " F"]:
     """Compute the confidence features, in the order of ``FEATURES``.
@@ -282,12 +281,11 @@ def evidence_of(
     Args:
         frames: image pairs, the reference first.
         refined: registered candidates, the best supported first.
-        neighbours: distinct places retrieved for the reference, the most similar first.
-        hypotheses: clusters of the most similar views of the reference.
-        places_m: x and y of all places, map frame, metres.
+        retrieved: places and clusters that retrieval found for the reference.
+        places_xy: x of all places, then y of all places, map frame, metres.
         grid: view grid of the map.
     """
-    evidence = Evidence(frames, refined, neighbours, hypotheses, places_m, grid)
+    evidence = Evidence(frames, refined, retrieved.neighbours, retrieved.hypotheses, places_xy, grid)
     return np.array([feature.of(evidence) for feature in TABLE])
 
 

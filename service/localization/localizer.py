@@ -139,16 +139,15 @@ class Localizer:
         require_promise(calibration if query.refine else None, query)
         # 1. Retrieval: the most similar places, clusters of the views, and the paper's K-NN vote over the streets.
         with stage("search"):
-            retrieved = retrieve(bundle, frames[0], self.clusters)
+            found = retrieve(bundle, frames[0], self.clusters)
         with stage("register"):
             # 2. Registration: refine candidate poses on the map cloud, and rank them.
             refined = None if cloud is None else refine(bundle, cloud, frames, query.prior, self.refining, predicted)
             # 3. Confidence features of the best candidate and its rivals.
-            near, clusters, places_m = retrieved.neighbours, retrieved.hypotheses, bundle.T_map_place[:, :2, 3]
-            evidence = None if refined is None else evidence_of(frames, refined, near, clusters, places_m, bundle.grid)
+            evidence = None if refined is None else evidence_of(frames, refined, found, bundle.places_xy, bundle.grid)
             # 4. Decision: status and calibrated confidence.
             decision = None if cloud is None else decision_of(calibration, query, refined, evidence)
-            return QueryResult(retrieved, refined, evidence, decision)
+            return QueryResult(found, refined, evidence, decision)
 
     def compose(self, frames: tuple[EncodedFrame, ...], found: QueryResult) -> Answer:
         """Build the answer.

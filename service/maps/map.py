@@ -82,7 +82,7 @@ class Map:
 
         Args:
             xy_m: x and y of the camera, map frame, m.
-            before_m: the same one step earlier.
+            before_m: x and y one step earlier, map frame, metres.
         """
 
     @property

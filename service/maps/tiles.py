@@ -263,7 +263,7 @@ class OpenTiles:
 
         Args:
             xy_m: x and y of the camera, map frame, m.
-            before_m: the same one step earlier; None if unknown.
+            before_m: x and y one step earlier, map frame, metres; None if unknown.
         """
         if not self.opens_ahead:
             return
@@ -589,7 +589,7 @@ class TiledMap(Map):
 
         Args:
             xy_m: x and y of the camera, map frame, m.
-            before_m: the same one step earlier.
+            before_m: x and y one step earlier, map frame, metres.
         """
         self.tiles.expect_around(xy_m, before_m)
 
@@ -681,7 +681,7 @@ def expected_next(
     Args:
         squares_m: x0, y0, x1, y1 of each tile, map frame, m.
         xy_m: x and y of the camera, map frame, m.
-        before_m: the same one step earlier; None if unknown.
+        before_m: x and y one step earlier, map frame, metres; None if unknown.
     """
     away_m = _away_m(squares_m, xy_m)
     step_m = np.zeros(2) if before_m is None else xy_m - before_m

@@ -16,6 +16,7 @@ from service.maps.calibration import read_calibration
 from service.retrieval.hypotheses import Hypothesis
 from service.retrieval.knn import Neighbour
 from service.retrieval.prior import Prior
+from service.retrieval.retrieve import Retrieved
 from service.scoring.candidates import Refined
 from service.scoring.confirmation import Confirmation
 
@@ -50,9 +51,10 @@ def weighed(candidate, frame):
         found = evidence_of(
             frames or (frame,),
             refined(*(candidates or [candidate()]), **options),
-            tuple(neighbours),
-            tuple(hypothesis(weight, apart_m * k) for k, weight in enumerate(weights)),
-            there,
+            Retrieved(
+                tuple(neighbours), tuple(hypothesis(weight, apart_m * k) for k, weight in enumerate(weights)), None
+            ),
+            np.ascontiguousarray(there.T),
             ViewGrid(),
         )
         assert found.shape == (len(FEATURES),)
