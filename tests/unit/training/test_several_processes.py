@@ -116,6 +116,29 @@ def test_two_processes_learn_the_same_as_one_and_only_the_first_writes(pack_fold
     assert len(list((folder / "run" / "tensorboard").iterdir())) == 1
 
 
+def test_two_processes_learn_the_same_as_one_in_mixed_precision(pack_folder, tmp_path, config):
+    """A forward pass in bfloat16 rounds to 8 bits. That changes the loss, for one process and for two alike.
+
+    The rate is low, because AdamW turns a rounding error of a small gradient into a whole step. There are no hard negatives, because
+    rounding could change their order.
+    """
+    changes = {"precision": "bfloat16", "steps": 5, "learning_rate": 1e-5, "memory_after": None}
+    mixed = config.model_copy(update=changes)
+    folder = tmp_path / "two"
+    with two_processes(pack_folder, folder, mixed) as process:
+        end(process)
+    losses = curve_of_one(pack_folder, tmp_path / "one", mixed)[1]
+    both = np.array(json.loads((folder / "losses.json").read_text()))
+    assert len(both) == mixed.steps
+    assert loss_gap(losses, both) < 5e-3
+    full = curve_of_one(pack_folder, tmp_path / "full", mixed.model_copy(update={"precision": "float32", "steps": 1}))[
+        1
+    ]
+    assert loss_gap(full, both[:1]) > 1e-5  # in float32, the first losses of one process and of two differ by 0.000001
+    kept = load_run(folder / "run").state_dict()
+    assert {weights.dtype for weights in kept.values() if weights.is_floating_point()} == {torch.float32}
+
+
 def test_a_run_resumes_after_a_process_was_killed(pack_folder, tmp_path, config):
     longer = config.model_copy(update={"steps": 100, "learning_rate": 1e-4})
     folder = tmp_path / "killed"
