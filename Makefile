@@ -62,9 +62,10 @@ test-service: .venv/.dev ## the tests of the service, without torch and the simu
 		$(addprefix tests/unit/,bridge client confidence console contract doctor geometry grpc http imaging localization maps \
 		registration retrieval runtime scoring) $(ARGS)
 
-test-ray: .venv/.torch ## builds of tiled maps on a Ray cluster whose workers, node and driver are killed; installs the extra `ray`
+test-ray: .venv/.torch ## tiled maps and training cities on a Ray cluster whose workers, node and driver are killed; installs the extra `ray`
 	$(INSTALL) 'ray>=2.50,<3'
-	$(BIN)/python -m pytest tests/unit/mapping/test_ray_cluster.py tests/unit/mapping/test_build_tiled.py -k ray $(ARGS)
+	$(BIN)/python -m pytest tests/unit/mapping/test_ray_cluster.py tests/unit/mapping/test_build_tiled.py \
+		tests/unit/training/test_ray_cities.py -k ray $(ARGS)
 
 check: .venv/.torch ## lint, types, layers, and whether the contracts equal the code
 	$(BIN)/ruff check

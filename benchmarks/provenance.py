@@ -165,8 +165,17 @@ _UPDATE = (
     "model_training/mapping/stored_map.py",
     "model_training/mapping/update.py",
 )
-#: Files in the folders above that no row of a report runs: tiled maps, object storage, Qdrant, commands for finished maps, and the
-#: comparison of stages. A test checks that the benchmark loads none of them.
+#: Training cities as files for other machines.
+CITY_ARCHIVES = (
+    "model_training/training/archive_places.py",
+    "model_training/training/archive_reader.py",
+    "model_training/training/city_archive.py",
+    "model_training/training/city_engines.py",
+    "model_training/training/city_task.py",
+    "model_training/training/unpacked_cities.py",
+)
+#: Files in the folders above that no row of a report runs: tiled maps, object storage, Qdrant, commands for finished maps, the
+#: comparison of stages, and training cities as files. A test checks that the benchmark loads none of them.
 NOT_RUN: dict[str, tuple[str, ...]] = {
     "accuracy": (
         *TILED_AND_STORED,
@@ -182,8 +191,9 @@ NOT_RUN: dict[str, tuple[str, ...]] = {
         "model_training/mapping/update_tiled.py",
         "model_training/mapping/verify.py",
         STAGES,
+        *CITY_ARCHIVES,
     ),
-    **dict.fromkeys(("choices", "kitti", "paper"), (STAGES,)),
+    **dict.fromkeys(("choices", "kitti", "paper"), (STAGES, *CITY_ARCHIVES)),
 }
 NOT_RUN["real_data"] = (
     *_UPDATE,

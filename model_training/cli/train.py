@@ -8,6 +8,8 @@ import typer
 from rich.console import Console
 
 from model_training.cli.progress import SILENT, bars
+from model_training.cli.training_cities import plans_of
+from model_training.training.archive_places import archives_at
 from model_training.training.loop import (
     Progress,
     TrainingConfig,
@@ -18,8 +20,9 @@ from model_training.training.loop import (
     train,
 )
 from model_training.training.processes import joined
-from model_training.training.recipe import RECIPES, STOCK_CITIES
+from model_training.training.recipe import STOCK_CITIES
 from model_training.training.shared_packs import make_packs_together
+from model_training.training.unpacked_cities import unpack_together
 from service.errors import DatasetError
 from service.imaging.view_grid import ViewGrid
 
@@ -42,6 +45,14 @@ def command(
         ),
     ] = None,
     packs: Annotated[Path, typer.Option(help="Folder of the simulated training cities.")] = Path("runs/packs"),
+    cities_from: Annotated[
+        str | None,
+        typer.Option(
+            help="Folder or URL that `streetfix simulate-training` wrote. The training unpacks its cities into --packs and simulates "
+            "none.  [default: simulate the cities]",
+            show_default=False,
+        ),
+    ] = None,
     steps: Annotated[int, typer.Option(help="Optimiser steps.", min=1)] = 4000,
     pairs: Annotated[int, typer.Option(help="Pairs of views per step, of all processes.", min=2, max=2048)] = 128,
     optimiser: Annotated[str, typer.Option(help="Optimiser: adamw or sgdm. The paper uses sgdm.")] = "adamw",
@@ -89,11 +100,12 @@ def command(
     Example, four processes of one machine that resume up to three times after a failure:
       torchrun --standalone --nproc-per-node 4 --max-restarts 3 --no-python -- \\
         streetfix train --run runs/mine
+    \b
+    Example, cities that another machine or a cluster of Ray has simulated:
+      streetfix simulate-training --out /shared/cities --engine ray
+      streetfix train --run runs/mine --cities-from /shared/cities
     """
-    if recipe not in RECIPES:
-        raise DatasetError(f"recipe: {recipe!r} is not valid; choose one of: {', '.join(RECIPES)}", field="recipe")
-    if cities is not None and recipe != "stock":
-        raise DatasetError(f"cities: the recipe {recipe!r} has fixed cities; omit --cities", field="cities")
+    plans = plans_of(recipe, cities)
     if optimiser not in ("adamw", "sgdm"):
         raise DatasetError(f"optimiser: {optimiser!r} is not valid; choose adamw or sgdm", field="optimiser")
     if precision not in ("float32", "bfloat16"):
@@ -102,6 +114,8 @@ def command(
         raise DatasetError(
             f"negatives: {negatives!r} is not valid; choose batch, look-alikes or memory", field="negatives"
         )
+    if cities_from is not None and workers is not None:
+        raise DatasetError("workers: nothing is simulated with --cities-from; omit --workers", field="workers")
     place = device_of(device)  # said before an hour of simulation, not after it
     with joined(place) as together:
         if shards is None:
@@ -125,10 +139,12 @@ def command(
         require_shards(config, together.count)
         if start_from is not None:
             require_start(start_from, config.encoder)
-        plans = RECIPES[recipe](cities or STOCK_CITIES)
         grid = ViewGrid(rows=config.encoder.rows, columns=config.encoder.columns)
         with bars() if together.is_first else nullcontext(SILENT) as report:
-            folders = make_packs_together(plans, packs, grid, together, workers=workers, report=report)
+            if cities_from is None:
+                folders = make_packs_together(plans, packs, grid, together, workers=workers, report=report)
+            else:
+                folders = unpack_together(plans, archives_at(cities_from), packs, grid, together, report=report)
 
             def show(progress: Progress) -> None:
                 stage = f"loss {progress.loss:.2f} {progress.accuracy:4.0%} {progress.images_per_s:.0f}/s"

@@ -31,6 +31,7 @@ _KNOWN = {
     "view": ("Show data, maps or answers in Rerun, Foxglove or Lichtblick.", "view"),
     "loadtest": ("Load a running service with the queries of a dataset.", "mapping"),
     "demo": ("Build a map, serve it and compare answers with ground truth.", "mapping"),
+    "simulate-training": ("Simulate the cities of a training for other machines.", "mapping"),
     "train": ("Train an encoder on simulated cities.", "training"),
     "average": ("Average the weights of two training runs.", "training"),
     "export": ("Export a trained encoder to ONNX.", "training"),
