@@ -26,7 +26,7 @@ from service.maps.calibration import Site, read_calibration
 from service.maps.manifest import read_manifest
 from service.maps.reader import MapBundle
 from service.maps.tiled_writer import joined_site, write_tiled
-from service.maps.tiles import LocalTiles, TiledMap, expected_next, in_order, open_map
+from service.maps.tiles import LocalTiles, OpenTiles, TiledMap, expected_next, in_order, open_map
 from service.maps.writer import replace_calibration, write_bundle
 from service.registration.surfel_tiles import nearest_square
 from service.retrieval.prior import Prior
@@ -319,6 +319,28 @@ def test_threads_open_a_tile_once(tiled: TiledMap, monkeypatch: pytest.MonkeyPat
     for thread in threads:
         thread.join()
     assert len(opened) == 1
+
+
+def test_closed_tiles_of_a_query_are_opened_side_by_side(tiled: TiledMap, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each opening waits until the other one has begun, and fails after ten seconds otherwise."""
+    both_began, open_one = threading.Barrier(2, timeout=10), OpenTiles._open
+
+    def opened(tiles: OpenTiles, tile: Any, **options: Any) -> MapBundle:
+        both_began.wait()
+        return open_one(tiles, tile, **options)
+
+    monkeypatch.setattr(OpenTiles, "_open", opened)
+    found = tiled.tiles.get_all([1, 0])
+    assert found[0] is tiled.tiles.get(1)
+    assert found[1] is tiled.tiles.get(0)
+
+
+def test_a_tile_that_cannot_be_opened_beside_others_is_reported(tiled_copy: Path) -> None:
+    opened = TiledMap.open(tiled_copy)
+    shutil.rmtree(tiled_copy / opened.manifest.tiles[1].folder)
+    with pytest.raises(BundleError, match="tile"):
+        opened.tiles.get_all([0, 1])
+    assert opened.tiles.opened == (0,)
 
 
 def test_the_search_index_chooses_the_tiles_of_a_large_map(
