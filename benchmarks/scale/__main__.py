@@ -20,14 +20,14 @@ from benchmarks.scale.search import SIZES, search_rows
 from benchmarks.scale.served import served_rows
 from benchmarks.scale.sources import RealDescriptors, real_descriptors, small_city
 from benchmarks.scale.store import store_rows
-from benchmarks.scale.town import town_folder, town_plan, town_rows
+from benchmarks.scale.town import open_rows, town_folder, town_plan, town_rows
 from model_training.datasets.dataset import Dataset
 from model_training.stock import ENCODER
 from service.maps.index import vectors_of
 from service.retrieval.encoder import Encoder
 
 #: Parts of the report.
-PARTS = ("search", "served", "built", "memory", "store", "town", "growth")
+PARTS = ("search", "served", "built", "memory", "store", "town", "ready", "growth")
 #: Code that determines the real descriptors.
 _DESCRIBING = (*SIMULATION, "service/imaging", "benchmarks/scale/sources.py", "model_training/mapping/places.py")
 
@@ -69,7 +69,7 @@ def main() -> None:
         default=list(PARTS),
         help="what to measure: search in drawn maps, requests with a prior on a tiled map (served), tiled builds that are killed, and both "
         "engines (built), the memory that a build of four small towns takes (memory), a map in object storage (store), a town of 20 km, "
-        "which takes an hour (town), retrieval in parts of this town (growth)",
+        "which takes an hour (town), the service that opens this town (ready; also part of town), retrieval in parts of this town (growth)",
     )
     parser.add_argument(
         "--stored",
@@ -105,12 +105,18 @@ def main() -> None:
     if "town" in arguments.only:
         town_rows(report, Runs(arguments.work, ENCODER))
         report.write()
-    if "growth" in arguments.only:
+    after_town = [part for part in ("ready", "growth") if part in arguments.only]
+    if after_town:
         runs = Runs(arguments.work, ENCODER)
         if not (folder := town_folder(runs)).exists():
-            parser.error("--only growth: needs the map of the town; add the part town")
-        growth_rows(report, folder, runs.dataset(town_plan()))
-        report.write()
+            parser.error(f"--only {' '.join(after_town)}: needs the map of the town; add the part town")
+        dataset = runs.dataset(town_plan())
+        if "ready" in after_town and "town" not in arguments.only:
+            open_rows(report, folder, dataset)
+            report.write()
+        if "growth" in after_town:
+            growth_rows(report, folder, dataset)
+            report.write()
 
 
 def _shown(argument: str) -> str:
