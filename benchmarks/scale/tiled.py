@@ -86,6 +86,14 @@ class DrawnTiles(OpenTiles):
         """Return the number of tiles."""
         return len(self.first_view) - 1
 
+    def get_all(self, numbers: Sequence[int]) -> list[Any]:
+        """Return several tiles, drawn one after another.
+
+        Args:
+            numbers: numbers of the tiles.
+        """
+        return [self.get(number) for number in numbers]
+
     def get(self, number: int) -> Any:
         """Return a tile.
 

@@ -16,6 +16,7 @@ from benchmarks.plans import BOTH
 from benchmarks.report import ROOT, Report
 from benchmarks.runs import MAPPING, Runs, accepted_within, code_hash, pooled, prior_with_std, share, within
 from benchmarks.serving.machines import Server, peak_mib
+from benchmarks.serving.sizes import STARTS
 from model_training.datasets.dataset import Dataset, QueryFrame
 from model_training.evaluation.measures import measure
 from model_training.simulation.plan import QueryPlan, SimulationPlan
@@ -162,12 +163,16 @@ def open_rows(report: Report, folder: Path, dataset: Dataset) -> None:
         folder: folder of the map.
         dataset: dataset with the queries.
     """
-    frames = list(islice(dataset.queries("drive1_precise"), LOAD))
+    frames, ready_s = list(islice(dataset.queries("drive1_precise"), LOAD)), []
+    for _ in range(STARTS - 1):
+        with Server(folder, core=None, workers=1, open_tile_bytes=OPEN_BYTES) as server:
+            ready_s.append(server.ready_s)
     with Server(folder, core=None, workers=1, open_tile_bytes=OPEN_BYTES) as server:
         answers = ask(server.url, frames, CLIENTS)
         peak = peak_mib(server.process.pid)
-    why = "`streetfix serve` with one worker, from the start of the process until /readyz answers 200"
-    report.row("town.ready_s", server.ready_s, "s", bar=2, better="lower", why=why)
+        ready_s.append(server.ready_s)
+    why = "`streetfix serve` with one worker, from the start of the process until /readyz answers 200; median"
+    report.row("town.ready_s", float(np.median(ready_s)), "s", bar=2, better="lower", n=STARTS, why=why)
     accepted = sum(answer.status == "LOCALIZED" for answer in answers)
     report.row(
         "town.resident_mib",
