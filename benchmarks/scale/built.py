@@ -22,10 +22,10 @@ from benchmarks.scale.town import watched_build
 from model_training.datasets.dataset import Dataset, scan_path, write_tum
 from model_training.loadtest.processes import descendants
 from model_training.mapping.build_tiled import build_tiled
-from model_training.mapping.engines import Engine
 from model_training.mapping.settings import BuildSettings
 from model_training.simulation.plan import SimulationPlan
 from model_training.stock import ENCODER
+from model_training.tasks.engines import Engine
 from model_training.training.recipe import EVALUATION_SEEDS
 from service.errors import RequestError
 from service.maps.manifest import Manifest, read_manifest

@@ -12,11 +12,11 @@ from model_training.datasets.stored_survey import StoredSurvey, dataset_at
 from model_training.mapping.build import build_map, describe, require_new
 from model_training.mapping.build_tiled import build_tiled
 from model_training.mapping.calibration_file import calibration_for
-from model_training.mapping.engines import Engine, require_engine
 from model_training.mapping.settings import BuildSettings
 from model_training.mapping.survey import kept_scans
 from model_training.mapping.tiles import require_tile_edge
 from model_training.stock import CALIBRATION, ENCODER
+from model_training.tasks.engines import Engine, require_engine
 from service.retrieval.encoder import Encoder
 
 _DEFAULT = BuildSettings(name="default")

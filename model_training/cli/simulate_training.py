@@ -7,8 +7,9 @@ from rich.console import Console
 
 from model_training.cli.progress import bars
 from model_training.cli.training_cities import plans_of
+from model_training.tasks.engines import Engine, require_engine
 from model_training.training.archive_places import archives_at
-from model_training.training.city_engines import Engine, require_engine, simulate_archives
+from model_training.training.city_engines import simulate_archives
 from model_training.training.recipe import RECIPES, STOCK_CITIES
 from service.imaging.view_grid import ViewGrid
 
@@ -55,7 +56,7 @@ def command(
       streetfix train --recipe streets --run runs/mine --cities-from /shared/cities
     """
     plans = plans_of(recipe, cities)
-    require_engine(engine)
+    require_engine(engine, workers)
     with bars() as report:
         simulate_archives(
             plans,

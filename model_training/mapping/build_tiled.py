@@ -11,11 +11,12 @@ from model_training.datasets.stored_survey import source_of
 from model_training.mapping.build import Report, require_new
 from model_training.mapping.build_tile import THREADS, CommonValues, TileTask, key_of_tile
 from model_training.mapping.calibration_file import calibration_for
-from model_training.mapping.engines import Engine, require_engine, run
+from model_training.mapping.engines import run
 from model_training.mapping.settings import BuildSettings
 from model_training.mapping.survey import kept_scans, sampled_survey
 from model_training.mapping.tiles import require_tile_edge, tile_parts
 from model_training.mapping.work import BuildCache, key_of, remove, work_beside
+from model_training.tasks.engines import Engine, require_engine
 from service.errors import BundleError
 from service.imaging.view_grid import ViewGrid
 from service.maps.manifest import Manifest

@@ -25,6 +25,7 @@ from service.registration.surfel_map import SurfelMap
 from service.retrieval.knn import ViewMatches
 from service.retrieval.query import Query
 from service.retrieval.retrieve import EncodedFrame
+from tests.unit.ray_nodes import ray_cluster  # noqa: F401  # a fixture for the tests of two packages
 from tests.unit.street_scene import (  # noqa: F401  # fixtures for the tests of several packages
     candidate,
     points_at,

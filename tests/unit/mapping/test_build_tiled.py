@@ -27,10 +27,10 @@ from model_training.mapping import engines, site_check
 from model_training.mapping.build import build_map, describe
 from model_training.mapping.build_tile import build_tile, key_of_tile
 from model_training.mapping.build_tiled import build_tiled
-from model_training.mapping.engines import _free_bytes, _raise, attempt, require_engine, usual_workers
 from model_training.mapping.settings import BuildSettings
 from model_training.mapping.tiles import TILE_MARGIN_M
 from model_training.mapping.work import work_folder
+from model_training.tasks import local
 from service.errors import BundleError, DatasetError, ExtraMissingError
 from service.maps.manifest import read_manifest
 from service.maps.reader import MapBundle
@@ -244,31 +244,15 @@ def test_a_process_that_sees_other_scans_refuses_the_tile(tasks_of, small_datase
         build_tile(task)
 
 
-def test_an_error_in_another_process_is_raised_as_it_was(tasks_of, small_dataset, tmp_path):
+def test_a_damaged_scan_stops_the_tile_and_is_named(tasks_of, small_dataset, tmp_path):
     own = Dataset(shutil.copytree(small_dataset.folder, tmp_path / "own"))
     task = tasks_of(own)[0]
     (own.folder / "survey" / "scans" / "000003.bin").write_bytes(b"cut")
     part = SurveyPart(own.folder, task.numbers, task.poses)
     sha256 = Encoder.open(task.encoder_file).sha256
-    failure = attempt(
-        replace(task, key=key_of_tile(part, sha256, task.settings, task.part, task.common)), lambda _: None
-    )
-    assert failure is not None
     with pytest.raises(DatasetError, match=r"000003\.bin.*truncated") as refused:
-        _raise(task, failure)
+        build_tile(replace(task, key=key_of_tile(part, sha256, task.settings, task.part, task.common)))
     assert refused.value.field == "000003.bin"
-
-
-@pytest.mark.parametrize(
-    ("failure", "error", "message"),
-    [
-        (("MemoryError", "...", ""), BundleError, "tile -1, -1: the memory is full; give fewer --workers"),
-        (("ZeroDivisionError", "the traceback", ""), RuntimeError, "tile -1, -1 failed:\nthe traceback"),
-    ],
-)
-def test_an_error_that_is_none_of_ours_names_the_tile(failure, error, message, tasks_of):
-    with pytest.raises(error, match=message):
-        _raise(tasks_of()[0], failure)
 
 
 def test_processes_give_the_same_bytes_although_one_is_killed(small_dataset, encoder_file, undisturbed, tmp_path):
@@ -432,29 +416,18 @@ def test_an_existing_map_a_wrong_edge_and_a_wrong_engine_are_refused_before_the_
     assert list(tmp_path.iterdir()) == []
 
 
-def test_memory_limits_the_number_of_processes(tasks_of, monkeypatch, tmp_path):
-    tasks = tasks_of()
-    monkeypatch.setattr(engines, "_cores", lambda: 8)
-    for free_tiles, expected in ((0.5, 1), (1.5, 1), (2.5, 2), (9.0, 2)):
-        free = int(free_tiles * max(engines.memory_of(task) for task in tasks))
-        monkeypatch.setattr(engines, "_free_bytes", lambda free=free: free)
-        assert usual_workers(tasks) == expected
-
-
-def test_free_memory_is_that_of_the_machine_or_of_the_control_group(tmp_path):
-    meminfo = tmp_path / "meminfo"
-    meminfo.write_text("MemTotal: 9000000 kB\nMemAvailable:   1000000 kB\n")
-    assert _free_bytes(meminfo, tmp_path) == 1000000 << 10
-    (tmp_path / "memory.max").write_text("700000000\n")
-    (tmp_path / "memory.current").write_text("200000000\n")
-    assert _free_bytes(meminfo, tmp_path) == 500000000
-    (tmp_path / "memory.max").write_text("max\n")
-    assert _free_bytes(meminfo, tmp_path) == 1000000 << 10
-
-
-def test_the_default_engine_needs_nothing():
-    require_engine("local", None)
-    require_engine("local", 3)
+def test_the_longest_tile_starts_first_and_no_more_tiles_than_fit_into_memory(tasks_of, monkeypatch):
+    """The second of two tiles has more scans."""
+    tasks, told = [replace(task, numbers=np.arange(count)) for task, count in zip(tasks_of(), (9, 11), strict=True)], []
+    largest = engines.PROCESS_BYTES + 11 * engines.SCAN_BYTES
+    monkeypatch.setattr(local, "_cores", lambda: 8)
+    monkeypatch.setattr(engines, "run_job", lambda _engine, job, workers, **usual: told.append((job, workers, usual)))
+    for free in (largest // 2, largest, 2 * largest - 1, 2 * largest, 9 * largest):
+        monkeypatch.setattr(local, "_free_bytes", lambda free=free: free)
+        engines.run("local", tasks, workers=None, on_progress=lambda *_: None, warn=lambda _: None)
+    assert [usual["usual_workers"] for _, _, usual in told] == [1, 1, 1, 2, 2]
+    assert {workers for _, workers, _ in told} == {None}
+    assert [list(job.order) for job, _, _ in told] == [[1, 0]] * 5
 
 
 @pytest.mark.parametrize("option", [{"workers": 2}, {"engine": "local"}])

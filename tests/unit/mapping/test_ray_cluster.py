@@ -5,7 +5,6 @@ import os
 import signal
 import subprocess
 import sys
-import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -13,12 +12,11 @@ from typing import Any
 import pytest
 
 from model_training.mapping.work import work_folder
+from tests.unit.ray_nodes import running_tasks, until
 
 ray = pytest.importorskip("ray", reason="needs the extra `ray`")
 
 BUILD = "from service.cli.start import main; main()"
-#: Ray names the process of a running task so.
-TASK = "ray::_in_task"
 TILE_M = 50
 
 
@@ -32,43 +30,8 @@ def files_of(folder: Path) -> dict[str, bytes]:
     return found
 
 
-def running_tasks() -> list[int]:
-    """Return the process ids of the tasks that run now."""
-    found = []
-    for folder in Path("/proc").glob("[0-9]*"):
-        try:
-            if (folder / "cmdline").read_bytes().startswith(TASK.encode()):
-                found.append(int(folder.name))
-        except OSError:  # the process has ended
-            continue
-    return found
-
-
-def until(is_true: Callable[[], Any], seconds: float = 120.0) -> Any:
-    end = time.monotonic() + seconds
-    while time.monotonic() < end:
-        if found := is_true():
-            return found
-        time.sleep(0.02)
-    raise AssertionError("it did not happen in time")
-
-
 @pytest.fixture
-def cluster(monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
-    """A head without cores, and two nodes with one core each. Each has processes of its own."""
-    from ray.cluster_utils import Cluster
-
-    monkeypatch.setenv("RAY_USAGE_STATS_ENABLED", "0")
-    made = Cluster(initialize_head=True, head_node_args={"num_cpus": 0, "include_dashboard": False})
-    try:
-        made.nodes = [made.add_node(num_cpus=1) for _ in range(2)]
-        yield made
-    finally:
-        made.shutdown()
-
-
-@pytest.fixture
-def start(cluster: Any, small_dataset: Any, encoder_file: Path, tmp_path: Path) -> Iterator[Callable[..., Any]]:
+def start(ray_cluster: Any, small_dataset: Any, encoder_file: Path, tmp_path: Path) -> Iterator[Callable[..., Any]]:
     """Return what starts a build as a user does, in a process of its own."""
     started: list[subprocess.Popen[str]] = []
 
@@ -89,7 +52,7 @@ def start(cluster: Any, small_dataset: Any, encoder_file: Path, tmp_path: Path) 
         command += ["--tile-m", str(TILE_M), "--engine", engine, "--workers", "2"]
         process = subprocess.Popen(
             command,
-            env=os.environ | {"RAY_ADDRESS": cluster.address},
+            env=os.environ | {"RAY_ADDRESS": ray_cluster.address},
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
             text=True,
@@ -113,13 +76,13 @@ def undisturbed(start: Callable[..., Any], tmp_path: Path) -> dict[str, bytes]:
 
 
 def test_a_build_survives_a_killed_worker_and_a_lost_node(
-    cluster: Any, start: Callable[..., Any], undisturbed: dict[str, bytes], tmp_path: Path
+    ray_cluster: Any, start: Callable[..., Any], undisturbed: dict[str, bytes], tmp_path: Path
 ) -> None:
     process = start("m")
     killed = until(running_tasks)[0]
     os.kill(killed, signal.SIGKILL)
     until(lambda: [pid for pid in running_tasks() if pid != killed])
-    cluster.remove_node(cluster.nodes[0], allow_graceful=False)
+    ray_cluster.remove_node(ray_cluster.nodes[0], allow_graceful=False)
     _, said = process.communicate(timeout=300)
     assert process.returncode == 0, said
     assert "WorkerCrashedError" in said

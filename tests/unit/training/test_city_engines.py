@@ -13,10 +13,10 @@ from model_training.training import city_engines, city_task
 from model_training.training.archive_places import FolderOfArchives, StoredArchives, archives_at
 from model_training.training.archive_reader import unpack_archive
 from model_training.training.city_archive import archive_name
-from model_training.training.city_engines import attempt, require_engine, simulate_archives
+from model_training.training.city_engines import simulate_archives
 from model_training.training.city_task import CityTask, code_of_cities, make_archive
 from model_training.training.packs import PackPlan, make_pack
-from service.errors import BundleError, DatasetError, ExtraMissingError
+from service.errors import DatasetError, ExtraMissingError
 
 PLAN = PackPlan(seed=1002, places=4, queries_a_place=1, lidar="vlp_16", size_m=(60.0, 60.0))
 OTHER = replace(PLAN, seed=1003)
@@ -52,12 +52,12 @@ def quick(monkeypatch):
 def serial(monkeypatch):
     """Run the tasks in this process."""
 
-    def run(tasks, _workers, on_done, _warn):
-        for each in tasks:
-            make_archive(each)
-            on_done()
+    def run(_engine, job, _workers, **_):
+        for index in job.order:
+            job.do(job.tasks[index], lambda _: None)
+            job.on_done(index)
 
-    monkeypatch.setattr(city_engines, "_run_local", run)
+    monkeypatch.setattr(city_engines, "run_job", run)
 
 
 class Killer:
@@ -177,29 +177,9 @@ def test_another_process_may_publish_the_same_archive_first(task, quick, monkeyp
 
 def test_a_process_of_another_release_refuses_the_task(task, tmp_path):
     assert task.code == code_of_cities()
-    failure = attempt(replace(task, code="another"))
-    assert failure is not None
-    assert failure[0] == "DatasetError"
-    assert "another release of streetfix, NumPy or OpenCV" in failure[1]
+    with pytest.raises(DatasetError, match="another release of streetfix, NumPy or OpenCV"):
+        make_archive(replace(task, code="another"))
     assert list(tmp_path.iterdir()) == []
-
-
-@pytest.mark.parametrize(
-    ("raised", "expected", "message"),
-    [
-        (BundleError("the store is full", field="out"), BundleError, "the store is full"),
-        (MemoryError(), DatasetError, "the memory is full; give fewer --workers, and run the command again"),
-        (ZeroDivisionError("a defect"), RuntimeError, r"(?s)Traceback.*a defect"),
-    ],
-)
-def test_an_error_of_another_process_is_raised_here(task, monkeypatch, raised, expected, message):
-    def fail(_: object) -> None:
-        raise raised
-
-    monkeypatch.setattr(city_engines, "make_archive", fail)
-    failure = attempt(task)
-    with pytest.raises(expected, match=message):
-        city_engines._raise(task, pickle.loads(pickle.dumps(failure)))  # noqa: S301  # as it comes from the process
 
 
 def test_the_memory_grows_with_the_arrays_of_the_city(task):
@@ -207,18 +187,9 @@ def test_the_memory_grows_with_the_arrays_of_the_city(task):
     assert task.memory_bytes - city_task.PROCESS_BYTES == 2 * 4 * (16 * 256 * 3 + 16 * 32 * 5)
 
 
-def test_a_task_asks_for_no_more_memory_than_a_machine_with_cores_has():
-    def node(memory, cores, *, alive=True):
-        return {"Alive": alive, "Resources": {"memory": memory} | ({"CPU": cores} if cores else {})}
-
-    nodes = [node(64.0, 0), node(32.0, 8, alive=False), node(8.0, 2), node(16.0, 4)]
-    assert city_engines._largest_memory(nodes) == 16.0
-    assert city_engines._largest_memory(nodes[:2]) == 0.0  # the cluster may start a machine later
-
-
 def test_engines_that_cannot_run_are_refused_before_the_work(grid, monkeypatch, tmp_path):
-    with pytest.raises(DatasetError, match="engine: 'slurm' is unknown; give local or ray"):
-        require_engine("slurm")
+    with pytest.raises(DatasetError, match="workers: 0 is not valid; give 1 or more"):
+        simulate_archives([PLAN], FolderOfArchives(tmp_path / "out"), grid, workers=0)
     monkeypatch.setitem(sys.modules, "ray", None)
     with pytest.raises(ExtraMissingError, match=r"--engine ray needs the package 'ray': .*\[ray\]"):
         simulate_archives([PLAN], FolderOfArchives(tmp_path / "out"), grid, engine="ray")

@@ -4,12 +4,13 @@ import os
 import signal
 import subprocess
 import sys
-import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
+
+from tests.unit.ray_nodes import running_tasks, until
 
 ray = pytest.importorskip("ray", reason="needs the extra `ray`")
 
@@ -33,48 +34,10 @@ simulate_archives(
     warn=lambda text: print(text, file=sys.stderr, flush=True),
 )
 """
-#: Ray names the process of a running task so.
-TASK = "ray::attempt"
-
-
-def running_tasks() -> list[int]:
-    """Return the process ids of the tasks that run now."""
-    found = []
-    for folder in Path("/proc").glob("[0-9]*"):
-        try:
-            if (folder / "cmdline").read_bytes().startswith(TASK.encode()):
-                found.append(int(folder.name))
-        except OSError:  # the process has ended
-            continue
-    return found
-
-
-def until(is_true: Callable[[], Any], seconds: float = 120.0) -> Any:
-    end = time.monotonic() + seconds
-    while time.monotonic() < end:
-        if found := is_true():
-            return found
-        time.sleep(0.02)
-    raise AssertionError("it did not happen in time")
 
 
 def files_of(folder: Path) -> dict[str, bytes]:
     return {path.name: path.read_bytes() for path in sorted(folder.iterdir())}
-
-
-@pytest.fixture
-def cluster(monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
-    """A head without cores, and two nodes with one core each. Each has processes of its own."""
-    from ray.cluster_utils import Cluster
-
-    monkeypatch.setenv("RAY_USAGE_STATS_ENABLED", "0")
-    monkeypatch.setenv("RAY_worker_niceness", "0")  # by default, other programs of a busy machine go first
-    made = Cluster(initialize_head=True, head_node_args={"num_cpus": 0, "include_dashboard": False})
-    try:
-        made.nodes = [made.add_node(num_cpus=1) for _ in range(2)]
-        yield made
-    finally:
-        made.shutdown()
 
 
 @pytest.fixture(scope="module")
@@ -87,13 +50,13 @@ def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
 
 
 @pytest.fixture
-def start(undisturbed: dict[str, bytes], cluster: Any, tmp_path: Path) -> Iterator[Callable[[], Any]]:
+def start(undisturbed: dict[str, bytes], ray_cluster: Any, tmp_path: Path) -> Iterator[Callable[[], Any]]:
     """Return what starts the simulation on the cluster, in a process of its own."""
     started: list[subprocess.Popen[str]] = []
 
     def simulate() -> "subprocess.Popen[str]":
         command = [sys.executable, "-c", CITIES, str(tmp_path / "cities"), "ray"]
-        environment = os.environ | {"RAY_ADDRESS": cluster.address}
+        environment = os.environ | {"RAY_ADDRESS": ray_cluster.address}
         started.append(subprocess.Popen(command, env=environment, stderr=subprocess.PIPE, text=True))
         return started[-1]
 
@@ -104,13 +67,13 @@ def start(undisturbed: dict[str, bytes], cluster: Any, tmp_path: Path) -> Iterat
 
 
 def test_ray_loses_no_city_with_a_killed_worker_and_a_lost_node(
-    cluster: Any, start: Callable[[], Any], undisturbed: dict[str, bytes], tmp_path: Path
+    ray_cluster: Any, start: Callable[[], Any], undisturbed: dict[str, bytes], tmp_path: Path
 ) -> None:
     process = start()
     killed = until(running_tasks)[0]
     os.kill(killed, signal.SIGKILL)
     until(lambda: [pid for pid in running_tasks() if pid != killed])
-    cluster.remove_node(cluster.nodes[0], allow_graceful=False)
+    ray_cluster.remove_node(ray_cluster.nodes[0], allow_graceful=False)
     _, said = process.communicate(timeout=300)
     assert process.returncode == 0, said
     assert "WorkerCrashedError" in said
