@@ -165,6 +165,12 @@ _UPDATE = (
     "model_training/mapping/stored_map.py",
     "model_training/mapping/update.py",
 )
+#: Builds of tiled maps.
+_TILED_BUILDS = (
+    "model_training/mapping/build_tile.py",
+    "model_training/mapping/build_tiled.py",
+    "model_training/mapping/engines.py",
+)
 #: Training cities as files for other machines.
 CITY_ARCHIVES = (
     "model_training/training/archive_places.py",
@@ -182,10 +188,8 @@ NOT_RUN: dict[str, tuple[str, ...]] = {
         "service/localization/track_bytes.py",
         "model_training/datasets/stored_survey.py",
         "model_training/datasets/survey_part.py",
-        "model_training/mapping/build_tile.py",
-        "model_training/mapping/build_tiled.py",
+        *_TILED_BUILDS,
         "model_training/mapping/diff.py",
-        "model_training/mapping/engines.py",
         "model_training/mapping/merge.py",
         "model_training/mapping/tiled_care.py",
         "model_training/mapping/update_tiled.py",
@@ -193,7 +197,7 @@ NOT_RUN: dict[str, tuple[str, ...]] = {
         STAGES,
         *CITY_ARCHIVES,
     ),
-    **dict.fromkeys(("choices", "kitti", "paper"), (STAGES, *CITY_ARCHIVES)),
+    **dict.fromkeys(("choices", "kitti", "paper"), (STAGES, *_TILED_BUILDS, *CITY_ARCHIVES)),
 }
 NOT_RUN["real_data"] = (
     *_UPDATE,
