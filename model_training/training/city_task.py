@@ -1,12 +1,13 @@
 """Make the archive of one training city. The result depends on nothing but the task, so any process on any machine may make it."""
 
 import hashlib
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cache
+from importlib.metadata import version
 from pathlib import Path
 
 import cv2
-import numpy as np
 from threadpoolctl import threadpool_limits
 
 import model_training
@@ -19,11 +20,22 @@ from service.imaging.view_grid import ViewGrid
 
 #: Memory of a process without the arrays of its city: the programs and the scene, bytes (decision 0192).
 PROCESS_BYTES = 512 << 20
-#: Code that decides what an archive contains.
+#: Code that decides what an archive contains: files, and folders with their ``.py`` and ``.so`` files.
 _CODE = (
-    (model_training, ("simulation", "training/packs.py", "training/matched_views.py", "training/city_archive.py")),
-    (service, ("imaging", "geometry")),
+    (
+        model_training,
+        (
+            "simulation",
+            "importing/stereo.py",
+            "training/packs.py",
+            "training/matched_views.py",
+            "training/city_archive.py",
+        ),
+    ),
+    (service, ("imaging", "geometry", "registration/points.py")),
 )
+#: Packages that decide it too, besides OpenCV, whose package has several names.
+_PACKAGES = ("numpy", "scipy", "shapely", "embreex")
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,13 +82,13 @@ def make_archive(task: CityTask) -> None:
         task: city and place.
 
     Raises:
-        DatasetError: this process has another release than the one that planned the task, or the archive cannot be written.
+        DatasetError: this process has other code than the one that planned the task, or the archive cannot be written.
         BundleError: the store does not take the archive.
     """
     if task.code != code_of_cities():
         raise DatasetError(
-            f"{task.name}: this process has another release of streetfix, NumPy or OpenCV than the process that started the command; "
-            "install the same releases on all machines",
+            f"{task.name}: this process has another build of streetfix, or another release of opencv, {', '.join(_PACKAGES[:-1])} or "
+            f"{_PACKAGES[-1]}, than the process that started the command; install the same ones on all machines",
             field="engine",
         )
     if task.place.has(task.name):  # made by an earlier attempt that was lost before it could say so
@@ -102,11 +114,18 @@ def make_archive(task: CityTask) -> None:
 
 @cache
 def code_of_cities() -> str:
-    """Return a hash of the code and of the versions of NumPy and OpenCV. They decide what an archive contains."""
-    found = hashlib.sha256(f"{np.__version__} {cv2.__version__}".encode())
+    """Return a hash of the code and of the versions of the packages that decide what an archive contains."""
+    found = hashlib.sha256(" ".join([cv2.__version__, *(version(name) for name in _PACKAGES)]).encode())
+    for file in _files():
+        found.update(file.name.encode() + file.read_bytes())
+    return found.hexdigest()
+
+
+def _files() -> Iterator[Path]:
+    """Yield the files of ``_CODE``."""
     for package, parts in _CODE:
         for part in parts:
             path = Path(package.__path__[0]) / part
-            for file in sorted(path.glob("*.py")) if path.is_dir() else (path,):
-                found.update(file.name.encode() + file.read_bytes())
-    return found.hexdigest()
+            for file in sorted(path.iterdir()) if path.is_dir() else (path,):
+                if file.suffix in (".py", ".so"):
+                    yield file

@@ -2,13 +2,16 @@
 
 import multiprocessing
 import pickle
+import subprocess
 import sys
 import threading
 from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 
+import service
 from model_training.training import city_engines, city_task
 from model_training.training.archive_places import FolderOfArchives, StoredArchives, archives_at
 from model_training.training.archive_reader import unpack_archive
@@ -177,9 +180,28 @@ def test_another_process_may_publish_the_same_archive_first(task, quick, monkeyp
 
 def test_a_process_of_another_release_refuses_the_task(task, tmp_path):
     assert task.code == code_of_cities()
-    with pytest.raises(DatasetError, match="another release of streetfix, NumPy or OpenCV"):
+    with pytest.raises(
+        DatasetError, match="another build of streetfix, or another release of opencv, numpy, scipy, shapely or embreex"
+    ):
         make_archive(replace(task, code="another"))
     assert list(tmp_path.iterdir()) == []
+
+
+def test_all_code_that_makes_a_pack_decides_whether_two_processes_agree():
+    """What packs load besides has no influence: readers of files, errors, and the registration, of which they take a constant."""
+    program = "import sys, model_training.training.packs; print(*(getattr(m, '__file__', None) for m in sys.modules.values()), sep='\\n')"
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    root = Path(service.__path__[0]).parent
+    loaded = {Path(name) for name in done.stdout.splitlines() if name.endswith(".py")}
+    left = {path.relative_to(root).as_posix() for path in loaded - {*city_task._files()} if path.is_relative_to(root)}
+    assert {name for name in left if not name.endswith("__init__.py")} == {
+        "model_training/datasets/files.py",
+        "service/compiled.py",
+        "service/errors.py",
+        "service/platforms.py",
+        "service/registration/kernel.py",
+    }
+    assert {"stereo.py", "scene.py", "_level.so", "_resample.so"} <= {path.name for path in city_task._files()}
 
 
 def test_the_memory_grows_with_the_arrays_of_the_city(task):
