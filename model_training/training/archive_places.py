@@ -185,16 +185,14 @@ class StoredArchives:
         """
         return self._remote().look(name) is not None
 
-    @contextmanager
-    def scratch(self, name: str, run: str) -> Iterator[Path]:  # noqa: ARG002  # the system removes what a killed process leaves
+    def scratch(self, name: str, run: str) -> AbstractContextManager[Path]:
         """Provide a temporary folder of this machine, as ``ArchivePlace.scratch``.
 
         Args:
-            name: not used.
-            run: not used.
+            name: file name of the archive.
+            run: name of the command that makes it.
         """
-        with tempfile.TemporaryDirectory(prefix="streetfix-") as folder:
-            yield Path(folder)
+        return scratch_beside(_temporary(name), run)
 
     def put(self, name: str, made: Path) -> None:
         """Upload an archive. The store shows it when it is complete.
@@ -210,12 +208,14 @@ class StoredArchives:
         self._remote().put(name, made)
 
     def clear(self, name: str, run: str = "") -> None:
-        """Do nothing: the store has no incomplete archive.
+        """Remove what killed processes of a command left on this machine. The store has no incomplete archive.
 
         Args:
-            name: not used.
-            run: not used.
+            name: file name of the archive.
+            run: name of the command. If it is empty, nothing is removed: a command that writes elsewhere may make the same city.
         """
+        if run:
+            clear_beside(_temporary(name), run)
 
     def fetched(self, name: str, scratch: Path) -> Path:
         """Fetch an archive into a file, as ``ArchivePlace.fetched``.
@@ -242,6 +242,10 @@ class StoredArchives:
 
     def _remote(self) -> Remote:
         return Remote.open(self.url, content=ARCHIVES)
+
+
+def _temporary(name: str) -> Path:
+    return Path(tempfile.gettempdir()) / f"streetfix-{name}"
 
 
 @contextmanager

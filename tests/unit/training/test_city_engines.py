@@ -4,6 +4,7 @@ import multiprocessing
 import pickle
 import subprocess
 import sys
+import tempfile
 import threading
 from collections.abc import Callable
 from dataclasses import replace
@@ -232,6 +233,19 @@ def test_archives_may_lie_in_object_storage(grid, quick, serial, tmp_path, in_st
     assert place.fetched(NAME, tmp_path).read_text() == PLAN.stem
     with pytest.raises(DatasetError, match=r"store/none\.tar is missing in the store; simulate them there"):
         place.fetched("none.tar", tmp_path)
+
+
+def test_what_killed_processes_left_of_a_stored_archive_goes_with_their_command(tmp_path, monkeypatch):
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    place = archives_at(f"file://{tmp_path}/store")
+    killed = [place.scratch(NAME, run) for run in ("first", "second")]  # never left
+    first, second = [scratch.__enter__() for scratch in killed]
+    assert sorted(tmp_path.iterdir()) == sorted([first, second])
+    place.clear(NAME)  # another command may be making it for another store
+    place.clear(OTHER_NAME, "first")
+    assert sorted(tmp_path.iterdir()) == sorted([first, second])
+    place.clear(NAME, "first")
+    assert list(tmp_path.iterdir()) == [second]
 
 
 def test_a_folder_is_absolute_so_that_processes_in_other_folders_find_it(tmp_path, monkeypatch):
