@@ -6,7 +6,7 @@ views exactly. Only the tiles are drawn instead of read from files.
 
 import time
 from collections import OrderedDict
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
