@@ -67,7 +67,8 @@ _HEIGHTS = (
 _OVER_BARE = (
     "Medians of runs differ by up to 20 %: full REST 0.95 to 1.13, retrieval REST 1.14 to 1.27, retrieval gRPC 1.14 to 1.39. With one "
     "client, full REST has 1.15 and retrieval REST 1.72. The bare pipeline takes 104 ms for a full request in this run, and 29 ms in "
-    "earlier runs, on another machine and with fewer stages (decision 0186). In those runs the event loop took 1.0 ms of a request, splitting the body 0.12 to 0.2 ms, writing "
+    "earlier runs, on another machine and with fewer stages (decision 0186). "
+    "In those runs the event loop took 1.0 ms of a request, splitting the body 0.12 to 0.2 ms, writing "
     "the answer 0.12 to 0.28 ms, and the dispatch of the framework 0.1 ms. These changes gained nothing: httptools and uvloop, fewer "
     "copies, no proxy headers, bodies that the system delivers in one piece, other intervals of thread switches and of garbage "
     "collection, one arena of malloc. Parsing the headers of all parts in one step gained 0.1 ms. Answers cannot be computed in the "
