@@ -183,8 +183,8 @@ house: .venv/.torch ## how readable code and documents are -> reports/house.json
 same-answers: .venv/.torch ## compare the answers of this commit with those of another: make same-answers BEFORE=COMMIT -> reports/checks
 	$(BIN)/python -m benchmarks.same_answers --before $(BEFORE) $(ARGS)
 
-docs-blocks: .venv/.torch ## run every code block of README and docs that can run here -> reports/console.json
-	$(BIN)/python -m benchmarks.docs_blocks $(ARGS)
+docs-blocks: .venv/.torch ## run every code block of README and docs that can run here -> reports/house.json
+	$(BIN)/python -m benchmarks.house --only blocks
 
 pictures: .venv/.torch ## the pictures of README and docs
 	$(BIN)/python -m benchmarks.pictures $(ARGS)

@@ -23,7 +23,7 @@ from pathlib import Path
 
 import yaml
 
-from benchmarks.report import ROOT, Report
+from benchmarks.report import ROOT
 
 #: The README comes first: it makes the dataset and the map that the other pages use.
 PAGES = (
@@ -259,17 +259,3 @@ def _wait_until_ready(url: str, process: "subprocess.Popen[bytes]") -> None:
         else:
             return
     raise TimeoutError(f"{url} is not ready after {_READY_S:g} s")
-
-
-def main() -> None:
-    """Add ``docs.code_blocks_run`` to ``reports/console.json``."""
-    report = Report("console", "python -m benchmarks.docs_blocks")
-    report.keep_others()
-    ran, total = code_blocks_run()
-    why = None if ran == total else f"{total - ran} of {total} failed"
-    report.row("docs.code_blocks_run", ran / total, "share", bar=1.0, n=total, why=why)
-    print(report.write())
-
-
-if __name__ == "__main__":
-    main()

@@ -105,7 +105,7 @@ MEASURED: dict[str, dict[str, tuple[str, ...]]] = {
         "trained_on_paper_city.": (*_CORE, *_DATA, "model_training/training"),
     },
     "choices": {"": (*_CORE, *_DATA, "model_training/training")},
-    "console": {"": ("service/console", "service/http"), "docs.": (*_ALL, "README.md", "docs")},
+    "console": {"": ("service/console", "service/http")},
     "house": {"": (*_ALL, "pyproject.toml", "README.md", "docs")},
     "kitti": {"": (*_CORE, *_DATA, "model_training/importing")},
     "paper": {"": (*_CORE, *_DATA, "research/baselines", "model_training/training")},
@@ -220,7 +220,7 @@ ONLY_RUN_BY: dict[str, dict[str, tuple[str, ...]]] = {
     "serving": {"service/maps/store": ("fuzz.",), "service/runtime/fetch_log.py": ("fuzz.",)},
 }
 #: Rows that measure text, by the beginning of their ids. For all other rows, comments and docstrings do not count.
-TEXT: dict[str, tuple[str, ...]] = {"house": ("",), "console": ("docs.",)}
+TEXT: dict[str, tuple[str, ...]] = {"house": ("",)}
 #: No map of these reports has as many views as ``inverted_file.SMALLEST``, which a test keeps. The largest has about 160,000.
 MOST_VIEWS = 1_000_000
 
