@@ -107,14 +107,16 @@ def test_the_service_is_asked_by_several_clients_without_a_prior(
 
     monkeypatch.setattr(town, "Server", Watched)
     monkeypatch.setattr(town, "LOAD", 3)
+    monkeypatch.setattr(town, "STARTS", 2)
     report = Report("scale", "make bench-scale")
     town.open_rows(report, stock_map, small_dataset)
     found = {row["id"]: row for row in report.rows}
     assert found["town.ready_s"]["value"] > 0
+    assert found["town.ready_s"]["n"] == 2
     assert found["town.resident_mib"]["value"] > 50
     assert found["town.resident_mib"]["n"] == 3
     assert "3 queries without a prior from 4 clients over REST" in found["town.resident_mib"]["why"]
-    assert [server.process.poll() for server in ended] == [0]
+    assert [server.process.poll() for server in ended] == [0, 0]
 
 
 @dataclass
