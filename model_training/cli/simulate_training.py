@@ -6,11 +6,10 @@ import typer
 from rich.console import Console
 
 from model_training.cli.progress import bars
-from model_training.cli.training_cities import plans_of
+from model_training.cli.training_cities import CitiesOption, RecipeOption, plans_of
 from model_training.tasks.engines import Engine, require_engine
 from model_training.training.archive_places import archives_at
 from model_training.training.city_engines import simulate_archives
-from model_training.training.recipe import RECIPES, STOCK_CITIES
 from service.imaging.view_grid import ViewGrid
 
 
@@ -22,18 +21,8 @@ def command(
             "finished cities in it."
         ),
     ],
-    recipe: Annotated[
-        str, typer.Option(help=f"Cities, as of `streetfix train --recipe`: {', '.join(RECIPES)}.")
-    ] = "stock",
-    cities: Annotated[
-        int | None,
-        typer.Option(
-            help=f"Cities of the stock recipe. Only this recipe takes the option.  [default: {STOCK_CITIES}]",
-            min=1,
-            max=1000,
-            show_default=False,
-        ),
-    ] = None,
+    recipe: RecipeOption = "stock",
+    cities: CitiesOption = None,
     engine: Annotated[
         Engine,
         typer.Option(

@@ -8,7 +8,7 @@ import typer
 from rich.console import Console
 
 from model_training.cli.progress import SILENT, bars
-from model_training.cli.training_cities import plans_of
+from model_training.cli.training_cities import CitiesOption, RecipeOption, plans_of
 from model_training.training.archive_places import archives_at
 from model_training.training.loop import (
     Progress,
@@ -20,7 +20,6 @@ from model_training.training.loop import (
     train,
 )
 from model_training.training.processes import joined
-from model_training.training.recipe import STOCK_CITIES
 from model_training.training.shared_packs import make_packs_together
 from model_training.training.unpacked_cities import unpack_together
 from service.errors import DatasetError
@@ -29,21 +28,8 @@ from service.imaging.view_grid import ViewGrid
 
 def command(
     run: Annotated[Path, typer.Option(help="Folder of the run: configuration, checkpoint, TensorBoard log.")],
-    recipe: Annotated[
-        str,
-        typer.Option(
-            help="stock: cities with modelled depth errors. streets: 60 small cities, most with stereo-matched depth, from a small "
-            "robot to a lorry. more-streets: 53 others of this kind. paper: the paper's city itself."
-        ),
-    ] = "stock",
-    cities: Annotated[
-        int | None,
-        typer.Option(
-            help=f"Cities of the stock recipe. Only this recipe takes the option.  [default: {STOCK_CITIES}]",
-            min=1,
-            max=1000,
-        ),
-    ] = None,
+    recipe: RecipeOption = "stock",
+    cities: CitiesOption = None,
     packs: Annotated[Path, typer.Option(help="Folder of the simulated training cities.")] = Path("runs/packs"),
     cities_from: Annotated[
         str | None,

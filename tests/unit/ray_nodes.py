@@ -1,5 +1,8 @@
 """A Ray cluster of two nodes, and its running tasks. Needs the extra ``ray``."""
 
+import os
+import signal
+import subprocess
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -31,6 +34,22 @@ def until(is_true: Callable[[], Any], seconds: float = 120.0) -> Any:
             return found
         time.sleep(0.02)
     raise AssertionError("it did not happen in time")
+
+
+def require_survival(cluster: Any, process: subprocess.Popen[str]) -> None:
+    """Kill a worker and lose a node while a command runs. Require that the command reports the worker and succeeds.
+
+    Args:
+        cluster: of ``ray_cluster``.
+        process: the command; its stderr is a pipe.
+    """
+    killed = until(running_tasks)[0]
+    os.kill(killed, signal.SIGKILL)
+    until(lambda: [pid for pid in running_tasks() if pid != killed])
+    cluster.remove_node(cluster.nodes[0], allow_graceful=False)
+    _, said = process.communicate(timeout=300)
+    assert process.returncode == 0, said
+    assert "WorkerCrashedError" in said
 
 
 @pytest.fixture

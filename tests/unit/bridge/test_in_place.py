@@ -14,6 +14,18 @@ from service.retrieval.prior import Prior
 from service.retrieval.query import Query
 
 
+def queries_of(localize: InPlace, monkeypatch: pytest.MonkeyPatch) -> list[Query]:
+    """Return a list that receives each query before it is answered."""
+    asked, answered = list[Query](), localize._localizer.localize
+
+    def keep(query: Query) -> Any:
+        asked.append(query)
+        return answered(query)
+
+    monkeypatch.setattr(localize._localizer, "localize", keep)
+    return asked
+
+
 @pytest.mark.parametrize(
     ("camera", "field"),
     [
@@ -42,15 +54,8 @@ def test_a_camera_height_that_is_given_counts_without_a_service_too(bundle_path:
 def test_gravity_and_prior_reach_the_query_without_a_service_too(
     bundle_path: Path, pictures: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    asked = list[Query]()
     localize = InPlace(bundle_path)
-    answered = localize._localizer.localize
-
-    def keep(query: Query) -> Any:
-        asked.append(query)
-        return answered(query)
-
-    monkeypatch.setattr(localize._localizer, "localize", keep)
+    asked = queries_of(localize, monkeypatch)
     known = Known(down_camera=np.array([0.0, 1.0, 0.0]), prior=Prior(position_m=np.array([20.0, 100.0])))
     localize(*(*pictures, known))
     (query,) = asked
@@ -83,15 +88,8 @@ def test_a_lens_beyond_the_contracts_bounds_is_refused_without_a_service_too(bun
 def test_a_baseline_reaches_the_query_without_a_service_too(
     bundle_path: Path, pictures: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    asked = list[Query]()
     localize = InPlace(bundle_path)
-    answered = localize._localizer.localize
-
-    def keep(query: Query) -> Any:
-        asked.append(query)
-        return answered(query)
-
-    monkeypatch.setattr(localize._localizer, "localize", keep)
+    asked = queries_of(localize, monkeypatch)
     for known in (Known(), Known(baseline_m=0.12)):
         localize(*(*pictures, known))
     assert [query.baseline_m for query in asked] == [None, 0.12]

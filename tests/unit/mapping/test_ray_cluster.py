@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 
 from model_training.mapping.work import work_folder
-from tests.unit.ray_nodes import running_tasks, until
+from tests.unit.ray_nodes import require_survival, running_tasks, until
 
 ray = pytest.importorskip("ray", reason="needs the extra `ray`")
 
@@ -78,14 +78,7 @@ def undisturbed(start: Callable[..., Any], tmp_path: Path) -> dict[str, bytes]:
 def test_a_build_survives_a_killed_worker_and_a_lost_node(
     ray_cluster: Any, start: Callable[..., Any], undisturbed: dict[str, bytes], tmp_path: Path
 ) -> None:
-    process = start("m")
-    killed = until(running_tasks)[0]
-    os.kill(killed, signal.SIGKILL)
-    until(lambda: [pid for pid in running_tasks() if pid != killed])
-    ray_cluster.remove_node(ray_cluster.nodes[0], allow_graceful=False)
-    _, said = process.communicate(timeout=300)
-    assert process.returncode == 0, said
-    assert "WorkerCrashedError" in said
+    require_survival(ray_cluster, start("m"))
     assert files_of(tmp_path / "m") == undisturbed
 
 

@@ -1,7 +1,6 @@
 """Training cities from a Ray cluster whose worker, node and driver are killed. Needs the extra ``ray`` (``make test-ray``)."""
 
 import os
-import signal
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
@@ -10,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from tests.unit.ray_nodes import running_tasks, until
+from tests.unit.ray_nodes import require_survival, running_tasks, until
 
 ray = pytest.importorskip("ray", reason="needs the extra `ray`")
 
@@ -69,14 +68,7 @@ def start(undisturbed: dict[str, bytes], ray_cluster: Any, tmp_path: Path) -> It
 def test_ray_loses_no_city_with_a_killed_worker_and_a_lost_node(
     ray_cluster: Any, start: Callable[[], Any], undisturbed: dict[str, bytes], tmp_path: Path
 ) -> None:
-    process = start()
-    killed = until(running_tasks)[0]
-    os.kill(killed, signal.SIGKILL)
-    until(lambda: [pid for pid in running_tasks() if pid != killed])
-    ray_cluster.remove_node(ray_cluster.nodes[0], allow_graceful=False)
-    _, said = process.communicate(timeout=300)
-    assert process.returncode == 0, said
-    assert "WorkerCrashedError" in said
+    require_survival(ray_cluster, start())
     assert files_of(tmp_path / "cities") == undisturbed
 
 
