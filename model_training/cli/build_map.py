@@ -12,6 +12,7 @@ from model_training.datasets.stored_survey import StoredSurvey, dataset_at
 from model_training.mapping.build import build_map, describe, require_new
 from model_training.mapping.build_tiled import build_tiled
 from model_training.mapping.calibration_file import calibration_for
+from model_training.mapping.frame_choice import in_chosen_frame
 from model_training.mapping.settings import BuildSettings
 from model_training.mapping.survey import kept_scans
 from model_training.mapping.tiles import require_tile_edge
@@ -115,6 +116,16 @@ def command(
             show_default=False,
         ),
     ] = None,
+    frame: Annotated[
+        str | None,
+        typer.Option(
+            help="Map frame: `survey` keeps that of the dataset. `global` takes the one that all maps of a region share. The folder of "
+            "a map takes the frame of that map. The last two need a georeference.  [default: global for a tiled map of a survey with "
+            "georeference, else survey]",
+            metavar="survey|global|MAP",
+            show_default=False,
+        ),
+    ] = None,
     engine: Annotated[
         Engine | None,
         typer.Option(
@@ -141,6 +152,7 @@ def command(
     Examples:
       streetfix build-map data/paper --out maps/paper-city
       streetfix build-map data/town --out maps/town --tile-m 500
+      streetfix build-map data/north --out maps/north --tile-m 500 --frame maps/town
       streetfix build-map s3://bucket/surveys/town --out maps/town --tile-m 500
     """
     if tile_m is None:
@@ -153,7 +165,8 @@ def command(
     if tile_m is not None:
         require_tile_edge(tile_m)
         require_engine(engine or "local", workers)
-    with bars() as report, dataset_at(dataset, out) as opened:
+    with bars() as report, dataset_at(dataset, out) as given:
+        opened = in_chosen_frame(given, frame, tiled=tile_m is not None)
         settings = BuildSettings(
             name=name or opened.name,
             spacing_m=spacing,

@@ -207,7 +207,10 @@ class _OfDrive:
 def _calibrate_rig(folder: Path, source: Dataset | RigFile, given: _OfDrive, out: Path | None, workers: int) -> None:
     began = time.monotonic()
     console = Console(highlight=False, soft_wrap=True)
-    bundle = part_for(open_map(folder), source, given.queries)
+    opened = open_map(folder)
+    if isinstance(source, Dataset):
+        source = source.in_frame(opened.manifest.georeference)
+    bundle = part_for(opened, source, given.queries)
     calibration = bundle.calibration
     if calibration is None:
         raise BundleError(

@@ -110,7 +110,8 @@ def command(
         # Only a report needs matplotlib, and its import takes longer than that of all others. It must not fail after the run.
         from model_training.reporting.run_page import write_run_page
     require_map_first(bundle, dataset, "evaluate")
-    opened, data = open_map(bundle), Dataset(dataset)
+    opened = open_map(bundle)
+    data = Dataset(dataset).in_frame(opened.manifest.georeference)
     names = queries or data.query_sets(with_truth=True)
     if trajectory is not None and len(names) != 1:
         raise DatasetError(

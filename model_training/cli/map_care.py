@@ -143,7 +143,10 @@ def merge(
 @app.command()
 def update(
     bundle: _Bundle,
-    dataset: Annotated[Path, typer.Argument(help="Dataset folder with a survey in the map's frame.")],
+    dataset: Annotated[
+        Path,
+        typer.Argument(help="Dataset folder with a survey. One of another georeference is moved into the map's frame."),
+    ],
     out: _Out,
     replace: Annotated[
         bool, typer.Option("--replace", help="Replace the area that the new survey covers, such as a rebuilt block.")

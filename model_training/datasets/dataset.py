@@ -4,8 +4,9 @@ Frames are read one at a time. No function loads a whole traversal.
 """
 
 import json
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
+from copy import copy
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal, Self
@@ -23,6 +24,7 @@ from pydantic import (
 )
 
 from model_training.datasets.files import ROW_BYTES, read_bytes, read_rows, reading, size_of
+from model_training.datasets.frames import MovedFrame, georeference_of
 from service.errors import DatasetError, StreetfixError
 from service.geometry.camera import PinholeCamera
 from service.geometry.rigid import quaternion_xyzw_from, rotation_from_quaternion_xyzw, transform_from
@@ -288,11 +290,14 @@ class Dataset:
 
     Attributes:
         folder: the dataset folder.
-        description: content of ``dataset.json``.
+        description: content of ``dataset.json``. Its georeference is that of ``frame``, if the dataset has been moved.
+        frame: map frame that replaces that of the folder. None: the dataset keeps its own.
 
     Raises:
         DatasetError: ``dataset.json`` is missing, damaged or of another format, or the folder is a map bundle.
     """
+
+    frame: MovedFrame | None = None
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
@@ -324,11 +329,48 @@ class Dataset:
         """Return the name of the dataset."""
         return self.description.name
 
+    def in_frame(self, georeference: Mapping[str, Any] | None) -> Self:
+        """Return this dataset with poses, ground truth and streets in another map frame.
+
+        A dataset whose position on the Earth is unknown stays as it is, and so does every dataset if the other frame's is unknown.
+
+        Args:
+            georeference: of the other frame, as in ``dataset.json``. None: unknown.
+
+        Raises:
+            DatasetError: a georeference is no place on the Earth, or the poses of the survey are damaged.
+        """
+        own = self.description.georeference
+        if own is None or georeference is None or own == georeference:
+            return self
+        moved_to = georeference_of(georeference, "the map")
+        if self.frame is not None:
+            return self.moved(replace(self.frame, moved_to=moved_to))
+        heights_m = self.survey_poses()[:, 2, 3] if self._has_survey() else np.zeros(0)
+        ground_m = float(heights_m.mean()) if len(heights_m) else 0.0
+        return self.moved(MovedFrame(georeference_of(own, f"{self.folder}/dataset.json"), moved_to, ground_m))
+
+    def moved(self, frame: MovedFrame | None) -> Self:
+        """Return this dataset with a frame that replaces that of its folder.
+
+        Args:
+            frame: the frame; None changes nothing.
+        """
+        if frame is None:
+            return self
+        found = copy(self)
+        found.frame = frame
+        found.description = self.description.model_copy(update={"georeference": frame.georeference})
+        return found
+
+    def _has_survey(self) -> bool:
+        return (self.folder / "survey" / "poses.txt").is_file()
+
     def streets(self) -> dict[str, Any] | None:
         """Return the GeoJSON of the streets, or None if the dataset has none.
 
         Raises:
-            DatasetError: the file vanished or is not JSON.
+            DatasetError: the file vanished, is not JSON, or has a feature without a geometry.
         """
         path = self.folder / "streets.geojson"
         if not path.exists():
@@ -337,7 +379,7 @@ class Dataset:
             loaded: dict[str, Any] = json.loads(read_bytes(path))
         except (ValueError, RecursionError) as error:
             raise DatasetError(f"{path}: not valid JSON: {error}", field="streets.geojson") from error
-        return loaded
+        return loaded if self.frame is None else self.frame.streets(loaded)
 
     def survey_poses(self) -> Transforms:
         """Return T_map_lidar of every scan (n, 4, 4), metres.
@@ -353,7 +395,8 @@ class Dataset:
         Raises:
             DatasetError: the pose file is missing or damaged.
         """
-        return read_tum(self.folder / "survey" / "poses.txt")
+        stamps, poses = read_tum(self.folder / "survey" / "poses.txt")
+        return stamps, poses if self.frame is None else self.frame.poses(poses)
 
     def scan(self, number: int) -> NDArray[np.float32]:
         """Return a scan (n, 4): x, y, z in the LiDAR frame (m) and intensity.
@@ -450,6 +493,8 @@ class Dataset:
             raise DatasetError(f"{self.folder} has no query set {name!r}; it has: {known}", field="queries")
         poses_path = folder / "poses.txt"
         stamps, truth = read_tum(poses_path) if poses_path.exists() else (None, None)
+        if self.frame is not None and truth is not None:
+            truth = self.frame.poses(truth)
         with reading(folder / "rgb"):
             pictures = sorted(p for p in (folder / "rgb").iterdir() if p.suffix in PICTURES and p.stem.isdigit())
         names = _camera_names(folder, len(pictures))

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from model_training.datasets.dataset import Dataset, ScanFile, Transforms, scan_path
+from model_training.datasets.frames import MovedFrame
 from model_training.datasets.survey_part import FolderSource, PartSource, SurveyPart
 from service.errors import BundleError, DatasetError
 from service.maps.store.fetch import concurrently
@@ -39,11 +40,13 @@ class StoredSource:
         url: URL of the dataset.
         files: description, streets and poses of the dataset as the store lists them, by their paths in the dataset.
         scans: scans of the part as the store lists them, by the names of their files.
+        frame: map frame of the part; None: that of the dataset.
     """
 
     url: str
     files: Mapping[str, StoredFile]
     scans: Mapping[str, StoredFile]
+    frame: MovedFrame | None = None
 
     @classmethod
     def found(cls, url: str) -> "StoredSource":
@@ -74,14 +77,17 @@ class StoredSource:
             digest.update(repr(file).encode())
         return digest.hexdigest()
 
-    def of(self, numbers: NDArray[np.int64]) -> "StoredSource":
+    def of(self, numbers: NDArray[np.int64], frame: MovedFrame | None) -> "StoredSource":
         """Return a part of the survey.
 
         Args:
             numbers: indices of the scans of the part (n,).
+            frame: map frame of the part; None: that of the dataset.
         """
         names = (scan_path(Path(), int(number)).name for number in numbers)
-        return StoredSource(self.url, self.files, {name: self.scans[name] for name in names if name in self.scans})
+        return StoredSource(
+            self.url, self.files, {name: self.scans[name] for name in names if name in self.scans}, frame
+        )
 
     def part(self, numbers: NDArray[np.int64], poses: Transforms, *, scratch: Path) -> SurveyPart:
         """Open the part, as ``PartSource.part``.
@@ -94,7 +100,7 @@ class StoredSource:
         Raises:
             DatasetError: the dataset cannot be opened.
         """
-        return StoredSurveyPart(self, scratch, numbers, poses)
+        return StoredSurveyPart(self, scratch, numbers, poses).moved(self.frame)
 
     def fetch_small(self, folder: Path, name: str) -> None:
         """Fetch a file other than a scan, unless it is there or the dataset has none.
@@ -160,6 +166,9 @@ class _Stored(Dataset):
     """A dataset whose files are fetched when they are read. Errors name the URL and not the fetched copy."""
 
     source: StoredSource
+
+    def _has_survey(self) -> bool:
+        return True  # StoredSource.found requires it, and the file may not have been fetched yet
 
     def streets(self) -> dict[str, Any] | None:
         """Return the GeoJSON of the streets, or None if the dataset has none.
@@ -283,7 +292,9 @@ def source_of(dataset: Dataset, numbers: NDArray[np.int64]) -> PartSource:
         dataset: the dataset.
         numbers: indices of the scans of the part (n,).
     """
-    return dataset.source.of(numbers) if isinstance(dataset, StoredSurvey) else FolderSource(dataset.folder.resolve())
+    if isinstance(dataset, StoredSurvey):
+        return dataset.source.of(numbers, dataset.frame)
+    return FolderSource(dataset.folder.resolve(), dataset.frame)
 
 
 @contextmanager

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from model_training.datasets.dataset import Dataset, ScanFile, Transforms, scan_path
+from model_training.datasets.frames import MovedFrame
 
 
 class SurveyPart(Dataset):
@@ -17,7 +18,8 @@ class SurveyPart(Dataset):
     Args:
         folder: folder of the whole dataset.
         numbers: indices of the scans of the part, ascending (n,).
-        poses: their T_map_lidar (n, 4, 4), metres. So nobody reads the poses of the whole survey again.
+        poses: their T_map_lidar (n, 4, 4), metres. So nobody reads the poses of the whole survey again. In a dataset that has been moved
+            into another frame, they are in that frame.
 
     Raises:
         DatasetError: the dataset cannot be opened.
@@ -96,9 +98,11 @@ class FolderSource:
 
     Attributes:
         folder: folder of the whole dataset.
+        frame: map frame of the part; None: that of the folder.
     """
 
     folder: Path
+    frame: MovedFrame | None = None
 
     def part(self, numbers: NDArray[np.int64], poses: Transforms, *, scratch: Path) -> SurveyPart:  # noqa: ARG002
         """Open the part, as ``PartSource.part``.
@@ -111,4 +115,4 @@ class FolderSource:
         Raises:
             DatasetError: the dataset cannot be opened.
         """
-        return SurveyPart(self.folder, numbers, poses)
+        return SurveyPart(self.folder, numbers, poses).moved(self.frame)

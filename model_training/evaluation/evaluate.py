@@ -46,7 +46,7 @@ def evaluate(
 
     Args:
         bundle: the map.
-        dataset: the dataset with the queries.
+        dataset: the dataset with the queries. If it has another georeference than the map, it is moved into the frame of the map.
         names: names of the query sets; None takes all sets with ground truth.
         refine: register the answers. False measures retrieval alone.
         workers: number of queries that are localized at the same time.
@@ -55,6 +55,7 @@ def evaluate(
     Raises:
         DatasetError: there is no query set with ground truth.
     """
+    dataset = dataset.in_frame(bundle.manifest.georeference)
     names = names or dataset.query_sets(with_truth=True)
     if not names:
         raise DatasetError(

@@ -7,6 +7,7 @@ from hashlib import sha256
 from typing import Any
 
 import numpy as np
+import shapely
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
@@ -16,6 +17,8 @@ from service.errors import BundleError
 from service.maps import inverted_file
 from service.maps.content import BundleContent
 
+#: Largest distance between two outlines of the same street, metres.
+SAME_STREET_M = 0.1
 #: Parameters that may differ between two traversals of one map.
 _OF_A_DRIVE = (
     "lidar_height_m",
@@ -178,6 +181,9 @@ def joined_streets(
 ) -> dict[str, Any] | None:
     """Join two GeoJSON collections of streets, those of ``a`` first, with one feature per id.
 
+    Two features of one id are the same if their properties are equal and their outlines differ by at most ``SAME_STREET_M``: a survey that
+    was moved into another frame has other roundings. Then that of ``a`` stays.
+
     Args:
         a: a FeatureCollection; None for no streets.
         b: another one.
@@ -192,14 +198,22 @@ def joined_streets(
     features = {feature["properties"]["id"]: feature for feature in a["features"]}
     for feature in b["features"]:
         name = feature["properties"]["id"]
-        if not newer and name in features and features[name] != feature:
+        known = None if newer else features.get(name)
+        if known is not None and not _same_street(known, feature):
             raise BundleError(
                 f"streets: both maps have a street {name!r}, but the two differ; give one of them another id, or the "
                 "same streets.geojson",
                 field="streets.geojson",
             )
-        features[name] = feature
+        features[name] = known or feature
     return {**a, "features": list(features.values())}
+
+
+def _same_street(a: Mapping[str, Any], b: Mapping[str, Any]) -> bool:
+    if a == b or a["properties"] != b["properties"]:
+        return a == b
+    first, second = (shapely.boundary(shapely.geometry.shape(each["geometry"])) for each in (a, b))
+    return bool(shapely.hausdorff_distance(first, second) <= SAME_STREET_M)  # NaN, so False, if one is empty
 
 
 def joined_calibration(a: Mapping[str, Any], b: Mapping[str, Any]) -> dict[str, Any]:

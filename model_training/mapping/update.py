@@ -115,7 +115,7 @@ def update_map(
 
     Args:
         old: folder of the bundle. It is not changed.
-        dataset: the dataset with the survey. Its poses must be in the map frame.
+        dataset: the dataset with the survey. If it has another georeference than the map, it is moved into the frame of the map.
         out: folder of the new bundle. It appears complete or not at all.
         replace_covered: replace the part that the survey covered.
         replace_area: GeoJSON file of a polygon, metres, map frame; replace the part inside it. None replaces no polygon.
@@ -127,13 +127,13 @@ def update_map(
     Raises:
         BundleError: the bundle is damaged, ``out`` exists and ``overwrite`` is False, streets contradict each other, or another process
             works on ``out``.
-        DatasetError: the survey is empty, damaged, in another frame, or too far away. Its LiDAR misses too many rows that the map's
-            LiDAR sees. The polygon file is not valid. None of the new places lies in the area to replace.
+        DatasetError: the survey is empty, damaged, too far away or without a known place in the map. Its LiDAR misses too many rows that
+            the map's LiDAR sees. The polygon file is not valid. None of the new places lies in the area to replace.
     """
     if out.exists() and not overwrite:
         raise BundleError(f"{out}: already exists; choose another --out, or pass --overwrite", field="out")
     bundle = MapBundle.open(old)
-    require_frame(dataset, bundle)
+    dataset = in_frame_of(dataset, bundle)
     replacement = Replacement.of(replace_covered, replace_area)
     # Refuse contradicting streets before the work, not at its end.
     joined_streets(streets_of_bundle(bundle), dataset.streets(), newer=replacement.replaces)
@@ -209,23 +209,25 @@ def without(content: BundleContent, cloud: VoxelMap, area: Area) -> BundleConten
     return of_places(content, ~area(content.T_map_place[:, :2, 3]))
 
 
-def require_frame(dataset: Dataset, bundle: Map) -> None:
-    """Refuse a survey in another frame than a map.
+def in_frame_of(dataset: Dataset, bundle: Map) -> Dataset:
+    """Return a survey in the frame of a map.
 
     Args:
         dataset: the dataset with the survey.
         bundle: the map.
 
     Raises:
-        DatasetError: the georeferences differ.
+        DatasetError: the position on the Earth is known of one of the two only.
     """
     of_map, of_drive = bundle.manifest.georeference, dataset.description.georeference
-    if of_map != of_drive:
+    if (of_map is None) != (of_drive is None):
         raise DatasetError(
             f"{dataset.folder}: the georeference of the dataset is {of_drive or 'missing'}, that of the map {bundle.path} is "
-            f"{of_map or 'missing'}; transform the poses of the survey into the map frame and use the georeference of the map",
+            f"{of_map or 'missing'}, so the survey has no known place in the map. If its poses are in the frame of the map, write the "
+            "georeference of the map into dataset.json. Else import the survey with its georeference",
             field="georeference",
         )
+    return dataset.in_frame(of_map)
 
 
 def require_rows(rows_seen: NDArray[np.bool_], bundle: Map, dataset: Dataset) -> None:

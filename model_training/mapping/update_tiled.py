@@ -24,7 +24,7 @@ from model_training.mapping.stored_map import content_of, streets_of_bundle, vox
 from model_training.mapping.survey import kept_scans
 from model_training.mapping.tiled_care import Square, tiles_of
 from model_training.mapping.tiles import TILE_MARGIN_M, TilePart, places_xy, tile_parts
-from model_training.mapping.update import Replacement, require_frame, require_rows, updated, without
+from model_training.mapping.update import Replacement, in_frame_of, require_rows, updated, without
 from model_training.mapping.voxel_map import MOMENTS, VoxelMap, lattice_origin
 from model_training.mapping.work import BuildCache, key_of, work_beside
 from service.errors import BundleError
@@ -62,7 +62,7 @@ def update_tiled(
 
     Args:
         old: folder of the tiled map. It is not changed.
-        dataset: the dataset with the survey. Its poses must be in the map frame.
+        dataset: the dataset with the survey. If it has another georeference than the map, it is moved into the frame of the map.
         out: folder of the new map. It appears complete or not at all.
         replace_covered: replace the part that the survey covered.
         replace_area: GeoJSON file of a polygon, metres, map frame; replace the part inside it. None replaces no polygon.
@@ -74,13 +74,13 @@ def update_tiled(
     Raises:
         BundleError: the map is damaged, ``out`` exists and ``overwrite`` is False, streets contradict each other, or another process
             works on ``out``. The tiles differ in ``voxel_m`` or ``between_m``.
-        DatasetError: the survey is empty, damaged or in another frame. Its LiDAR misses too many rows that the map's LiDAR sees. The
-            polygon file is not valid. None of the new places lies in the area to replace.
+        DatasetError: the survey is empty, damaged or without a known place in the map. Its LiDAR misses too many rows that the map's
+            LiDAR sees. The polygon file is not valid. None of the new places lies in the area to replace.
     """
     if out.exists() and not overwrite:
         raise BundleError(f"{out}: already exists; choose another --out, or pass --overwrite", field="out")
     whole = TiledMap.open(old)
-    require_frame(dataset, whole)
+    dataset = in_frame_of(dataset, whole)
     _require_common(whole)
     replacement = Replacement.of(replace_covered, replace_area)
     # The streets of an updated tile must be those of the other tiles, so a survey cannot change a street here.
@@ -109,7 +109,7 @@ def update_tiled(
             tile = _Tile(
                 old / (own or whole.manifest.tiles[0]).folder,
                 None if own else [old / each.folder for square, each in tiles.items() if _touch(square, part)],
-                SurveyPart(dataset.folder, numbers, poses[numbers]),
+                SurveyPart(dataset.folder, numbers, poses[numbers]).moved(dataset.frame),
                 part,
                 passes_vote,
                 encoder,

@@ -89,6 +89,18 @@ class Georeference:
         )
         return turned
 
+    def T_to(self, other: "Georeference") -> Float64[NDArray[np.float64], "4 4"]:
+        """Return T_other_map: the pose of this map frame in the frame of another georeference, metres. It is exact.
+
+        Args:
+            other: georeference of the other frame.
+        """
+        to_other = other._east_north_up()
+        T: Float64[NDArray[np.float64], "4 4"] = np.eye(4)
+        T[:3, :3] = to_other @ self._east_north_up().T
+        T[:3, 3] = to_other @ (self._origin() - other._origin())
+        return T
+
     def _origin(self) -> Float64[NDArray[np.float64], "3"]:
         return _earth_centred(self.latitude_deg, self.longitude_deg, self.height_m)
 
