@@ -16,6 +16,8 @@ from numpy.typing import NDArray
 from service.errors import DatasetError
 from service.geometry.earth import Georeference
 
+#: A tenth of a millimetre. More digits would double the size of the file.
+_STREET_DECIMALS = 4
 #: Origins of global frames for each degree of latitude and of longitude (decision 0195).
 _ORIGINS_PER_DEG = 10
 
@@ -61,7 +63,7 @@ class MovedFrame:
 
         def moved(xy: Float64[NDArray[np.float64], "n 2"]) -> Float64[NDArray[np.float64], "n 2"]:
             at = np.column_stack([xy, np.full(len(xy), self.ground_m)])
-            found: Float64[NDArray[np.float64], "n 2"] = at @ T[:2, :3].T + T[:2, 3]
+            found: Float64[NDArray[np.float64], "n 2"] = np.round(at @ T[:2, :3].T + T[:2, 3], _STREET_DECIMALS)
             return found
 
         try:

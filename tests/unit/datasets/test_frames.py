@@ -99,7 +99,7 @@ def test_streets_lie_at_the_height_of_the_survey():
         ]
     }
     (x, y), _ = frame.streets(street)["features"][0]["geometry"]["coordinates"]
-    assert x == pytest.approx((6_378_137.0 + 500.0) * np.sin(np.deg2rad(1.0)))
+    assert x == pytest.approx((6_378_137.0 + 500.0) * np.sin(np.deg2rad(1.0)), abs=1e-4)
     assert y == pytest.approx(7.0)
 
 
