@@ -37,9 +37,8 @@ def test_an_origin_on_the_other_side_of_the_equator():
     """A quarter of the Earth to the east, east becomes up, and up becomes west. The radius is 6,378,137 m."""
     T = Georeference(0.0, 0.0).T_to(Georeference(0.0, 90.0))
     radius = 6_378_137.0
-    np.testing.assert_allclose(
-        T, [[0, 0, -1, -radius], [0, 1, 0, 0], [1, 0, 0, -radius], [0, 0, 0, 1]], rtol=1e-15, atol=1e-8
-    )
+    expected = np.array([[0, 0, -1, -radius], [0, 1, 0, 0], [1, 0, 0, -radius], [0, 0, 0, 1]])
+    np.testing.assert_allclose(T, expected, rtol=1e-15, atol=1e-8)
 
 
 @given(LATITUDES, LONGITUDES, st.floats(-0.5, 0.5), st.floats(-0.5, 0.5))
