@@ -33,7 +33,7 @@ def test_an_origin_100_m_higher_lowers_everything_by_100_m():
     np.testing.assert_allclose(T, [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, -100], [0, 0, 0, 1]], atol=1e-8)
 
 
-def test_an_origin_on_the_other_side_of_the_equator():
+def test_an_origin_a_quarter_of_the_earth_away():
     """A quarter of the Earth to the east, east becomes up, and up becomes west. The radius is 6,378,137 m."""
     T = Georeference(0.0, 0.0).T_to(Georeference(0.0, 90.0))
     radius = 6_378_137.0
