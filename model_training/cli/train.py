@@ -77,7 +77,7 @@ def command(
 ) -> None:
     """Simulate training cities and train an encoder on them.
 
-    Ctrl-C saves a checkpoint. The same command then resumes the training.
+    Ctrl-C or SIGTERM saves a checkpoint. The same command then resumes the training.
 
     \b
     Example, an encoder of your own:

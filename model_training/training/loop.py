@@ -147,7 +147,7 @@ def train(
     """Train an encoder on packs.
 
     The folder of the run holds ``config.json``, ``checkpoint.pt`` and the TensorBoard log.
-    The first Ctrl-C saves a checkpoint and ends. The same call continues from there.
+    The first Ctrl-C or SIGTERM saves a checkpoint and ends. The same call continues from there.
     Several processes share each batch. They learn the same as one process with the same ``config``, except for rounding.
 
     Args:
@@ -658,16 +658,21 @@ def _set_rate(optimiser: torch.optim.Optimizer, config: TrainingConfig, step: in
 
 
 class _Interrupt:
-    """Handle Ctrl-C: the first ends the run after the step, the second ends it at once."""
+    """Handle Ctrl-C and SIGTERM: the first ends the run after the step, the second ends it at once.
+
+    torchrun sends SIGTERM before it starts the processes again, and a cluster before it takes a machine away.
+    """
 
     def __init__(self) -> None:
         self.asked = False
 
     def __enter__(self) -> "_Interrupt":
-        try:
-            self._before = signal.signal(signal.SIGINT, self._note)
-        except ValueError:  # only the main thread may set a signal handler
-            self._before = None
+        self._before: dict[signal.Signals, Any] = {}
+        for number in (signal.SIGINT, signal.SIGTERM):
+            try:
+                self._before[number] = signal.signal(number, self._note)
+            except ValueError:  # only the main thread may set a signal handler
+                break
         return self
 
     def _note(self, _signal: int, _frame: FrameType | None) -> None:
@@ -676,5 +681,5 @@ class _Interrupt:
         self.asked = True
 
     def __exit__(self, *_: object) -> None:
-        if self._before is not None:
-            signal.signal(signal.SIGINT, self._before)
+        for number, handler in self._before.items():
+            signal.signal(number, handler)

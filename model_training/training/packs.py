@@ -8,9 +8,12 @@ The panoramas are levelled and resampled like those of a real survey.
 import hashlib
 import multiprocessing
 import os
+import secrets
+import shutil
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
+from glob import escape
 from pathlib import Path
 
 import numpy as np
@@ -170,13 +173,14 @@ def make_packs(
 
 
 def _make_in(plan: PackPlan, root: Path, grid: ViewGrid) -> None:
-    make_pack(plan, root / plan.stem, grid)
+    if not (root / plan.stem).exists():  # processes of a killed command end their city, and may have made it meanwhile
+        make_pack(plan, root / plan.stem, grid)
 
 
 def make_pack(plan: PackPlan, folder: Path, grid: ViewGrid) -> None:
     """Simulate a city and write its pack.
 
-    The folder appears only when it is complete.
+    The folder appears only when it is complete. Several processes may make the same city: their packs are equal, and one stays.
 
     Args:
         plan: the city.
@@ -213,11 +217,19 @@ def make_pack(plan: PackPlan, folder: Path, grid: ViewGrid) -> None:
         "rows_seen": rows_seen_by(panoramas),
     }
     arrays |= (_matched_queries if plan.rigs else _queries)(city, plan, places, grid, rng)
-    part = folder.with_name(folder.name + ".part")
-    part.mkdir(parents=True, exist_ok=True)
-    for name, array in arrays.items():
-        np.save(part / f"{name}.npy", array)
-    part.rename(folder)
+    part = folder.with_name(f"{folder.name}.{secrets.token_hex(4)}.part")
+    part.mkdir(parents=True)
+    try:
+        for name, array in arrays.items():
+            np.save(part / f"{name}.npy", array)
+        part.rename(folder)
+    except OSError:
+        if not folder.exists():  # else another process has made the pack, and perhaps removed the folder of this one
+            raise
+    finally:
+        shutil.rmtree(part, ignore_errors=True)
+    for left in folder.parent.glob(f"{escape(folder.name)}.*part"):  # of killed processes
+        shutil.rmtree(left, ignore_errors=True)
 
 
 def _matched_queries(

@@ -4,9 +4,11 @@ Every process holds the whole network and the whole descriptor memory, and it re
 Control data goes over gloo. Tensors of a GPU go over NCCL.
 """
 
+import multiprocessing
 import os
 import secrets
 import socket
+import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -20,9 +22,13 @@ import torch
 import torch.distributed as dist
 from numpy.typing import NDArray
 from torch import Tensor
-from torch.distributed import PrefixStore, Store, TCPStore  # type: ignore[attr-defined]  # torch documents them
+from torch.distributed import PrefixStore, ProcessGroupGloo, Store, TCPStore  # type: ignore[attr-defined]  # torch documents them
 
+from model_training.training.watch import LOST_AFTER_S, Watch
 from service.errors import DatasetError, StreetfixError
+
+#: Longest time from the start of a process to that of the last one, seconds. Packages on a network drive load slowly.
+START_WITHIN_S = 300.0
 
 
 @dataclass(frozen=True)
@@ -187,6 +193,8 @@ ALONE = Processes()
 def joined(place: torch.device) -> Iterator[Processes]:
     """Join the processes that torchrun started. Without torchrun, or with one process, the process trains alone.
 
+    If another process fails or is lost, this one ends with exit code 1 (``watch``). torchrun can then start all processes again.
+
     Args:
         place: training device of the command.
 
@@ -199,13 +207,12 @@ def joined(place: torch.device) -> Iterator[Processes]:
         return
     rank, local_rank = int(os.environ["RANK"]), int(os.environ["LOCAL_RANK"])
     local_count = int(os.environ["LOCAL_WORLD_SIZE"])
-    if os.environ.get("TORCHELASTIC_USE_AGENT_STORE") == "True":
-        agent = TCPStore(os.environ["MASTER_ADDR"], int(os.environ["MASTER_PORT"]), is_master=False)
-        store = PrefixStore(name_of_start(agent, rank, count), agent)
-        dist.init_process_group("gloo", store=store, rank=rank, world_size=count)
-    else:
-        dist.init_process_group("gloo")
+    store, failed = _store_of_start(rank, count), True
+    # First the watch: a process that is lost now would keep the others waiting in ``init_process_group``.
+    watched = ProcessGroupGloo(PrefixStore("watch", store), rank, count, timedelta(seconds=LOST_AFTER_S))
+    watch = Watch(watched, _end)
     try:
+        dist.init_process_group("gloo", store=PrefixStore("work", store), rank=rank, world_size=count)
         seen: list[Any] = [None] * count
         dist.all_gather_object(seen, (place.type, torch.cuda.device_count(), local_count, socket.gethostname()))
         require_devices(seen)
@@ -214,11 +221,43 @@ def joined(place: torch.device) -> Iterator[Processes]:
             torch.cuda.set_device(local_rank)
             tensors = dist.new_group(backend="nccl")
         yield Processes(rank, count, local_rank, local_count, tensors)
+        failed = False
     finally:
-        dist.destroy_process_group()
+        watch.leave(failed=failed)
+        if dist.is_initialized():
+            dist.destroy_process_group()
 
 
-def name_of_start(agent: Store, rank: int, count: int, *, limit_s: float = 1800.0) -> str:
+def _store_of_start(rank: int, count: int) -> Store:
+    """Return the key store of the processes, without keys of an earlier start.
+
+    Args:
+        rank: number of this process.
+        count: number of processes.
+    """
+    host, port = os.environ["MASTER_ADDR"], int(os.environ["MASTER_PORT"])
+    if os.environ.get("TORCHELASTIC_USE_AGENT_STORE") == "True":
+        agent = TCPStore(host, port, is_master=False)
+        return PrefixStore(name_of_start(agent, rank, count), agent)
+    return TCPStore(host, port, count, rank == 0, timedelta(seconds=START_WITHIN_S))
+
+
+def _end(reason: str) -> None:
+    """End this process, because it cannot go on without another one. Its main thread may wait in gloo, NCCL or for a file.
+
+    Args:
+        reason: what happened to the other process.
+    """
+    sys.stderr.write(
+        f"streetfix: {reason}; this process ends, and torchrun starts the processes again if --max-restarts allows it\n"
+    )
+    sys.stderr.flush()
+    for simulating in multiprocessing.active_children():
+        simulating.terminate()
+    os._exit(1)
+
+
+def name_of_start(agent: Store, rank: int, count: int, *, limit_s: float = START_WITHIN_S) -> str:
     """Agree on a name that no earlier start of the same processes used.
 
     torchrun keeps one store for all its restarts. There, a process would find the addresses of processes that have ended,

@@ -67,13 +67,17 @@ def test_one_seed_gives_one_encoder(pack_folder, tmp_path, config):
     assert_same_weights(*(run_of(pack_folder, tmp_path / name, config) for name in ("one", "other")))
 
 
-def test_a_run_that_was_interrupted_goes_on_to_the_same_weights(pack_folder, tmp_path, config):
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_run_that_was_interrupted_goes_on_to_the_same_weights(pack_folder, tmp_path, config, number):
+    before = signal.getsignal(number)
+
     def interrupt(progress):
         if progress.step == 6:
-            os.kill(os.getpid(), signal.SIGINT)
+            os.kill(os.getpid(), number)
 
     with pytest.raises(KeyboardInterrupt):
         run_of(pack_folder, tmp_path / "cut", config, report=interrupt)
+    assert signal.getsignal(number) == before
     steps = []
     resumed = run_of(pack_folder, tmp_path / "cut", config, report=lambda progress: steps.append(progress.step))
     assert steps[0] in (7, 8)

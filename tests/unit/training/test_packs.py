@@ -95,6 +95,22 @@ def test_remains_of_a_stopped_run_do_no_harm(pack, grid, tmp_path):
     (tmp_path / "new.part" / "places.npy").write_bytes(b"half")
     make_pack(PLAN, tmp_path / "new", grid)
     np.testing.assert_array_equal(Pack.open(tmp_path / "new").places, pack.places)
+    assert [path.name for path in tmp_path.iterdir()] == ["new"]
+
+
+def test_a_pack_that_another_process_makes_meanwhile_stays(grid, tmp_path, monkeypatch):
+    """A killed training leaves processes that simulate. The next training makes the same city beside them."""
+    folder = tmp_path / "city"
+
+    def meanwhile(*_):
+        folder.mkdir()
+        (folder / "places.npy").write_bytes(b"of the other process")
+        return {}
+
+    monkeypatch.setattr(module, "_queries", meanwhile)
+    make_pack(PLAN, folder, grid)
+    assert (folder / "places.npy").read_bytes() == b"of the other process"
+    assert [path.name for path in tmp_path.iterdir()] == ["city"]
 
 
 def test_packs_that_are_there_are_not_made_again(grid, tmp_path):
