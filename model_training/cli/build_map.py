@@ -7,6 +7,7 @@ import typer
 from rich.console import Console
 
 from model_training.cli.progress import bars
+from model_training.cli.tile_options import EngineOption, WorkersOption, refuse_without_tiles
 from model_training.datasets.dataset import MOST_SURVEY_STD_DEG, MOST_SURVEY_STD_M
 from model_training.datasets.stored_survey import StoredSurvey, dataset_at
 from model_training.mapping.build import build_map, describe, require_new
@@ -17,7 +18,7 @@ from model_training.mapping.settings import BuildSettings
 from model_training.mapping.survey import kept_scans
 from model_training.mapping.tiles import require_tile_edge
 from model_training.stock import CALIBRATION, ENCODER
-from model_training.tasks.engines import Engine, require_engine
+from model_training.tasks.engines import require_engine
 from service.retrieval.encoder import Encoder
 
 _DEFAULT = BuildSettings(name="default")
@@ -126,22 +127,8 @@ def command(
             show_default=False,
         ),
     ] = None,
-    engine: Annotated[
-        Engine | None,
-        typer.Option(
-            help="What builds the tiles: processes of this machine, or tasks of Ray (extra `ray`). RAY_ADDRESS names a cluster.  "
-            "[default: local]",
-            show_default=False,
-        ),
-    ] = None,
-    workers: Annotated[
-        int | None,
-        typer.Option(
-            help="Number of tiles at the same time.  [default: one per core, fewer if the memory does not suffice]",
-            min=1,
-            show_default=False,
-        ),
-    ] = None,
+    engine: EngineOption = None,
+    workers: WorkersOption = None,
     overwrite: Annotated[bool, typer.Option(help="Replace an existing map bundle.")] = False,
 ) -> None:
     """Build a map bundle from a dataset's survey.
@@ -156,9 +143,7 @@ def command(
       streetfix build-map s3://bucket/surveys/town --out maps/town --tile-m 500
     """
     if tile_m is None:
-        for option, value in (("--engine", engine), ("--workers", workers)):
-            if value is not None:
-                raise typer.BadParameter("it builds tiles; give --tile-m too", param_hint=option)
+        refuse_without_tiles(engine, workers, remedy="give --tile-m too")
     # What can be refused is refused before scans are fetched.
     require_new(out, name or "unnamed", overwrite=overwrite)
     calibration_for(calibration, Encoder.open(encoder).sha256)
