@@ -165,11 +165,14 @@ _UPDATE = (
     "model_training/mapping/stored_map.py",
     "model_training/mapping/update.py",
 )
-#: Builds of tiled maps.
+#: Builds and updates of tiled maps.
 _TILED_BUILDS = (
     "model_training/mapping/build_tile.py",
     "model_training/mapping/build_tiled.py",
     "model_training/mapping/engines.py",
+    "model_training/mapping/tile_tasks.py",
+    "model_training/mapping/update_tile.py",
+    "model_training/mapping/update_tiled.py",
 )
 #: Training cities as files for other machines.
 CITY_ARCHIVES = (
@@ -192,7 +195,6 @@ NOT_RUN: dict[str, tuple[str, ...]] = {
         "model_training/mapping/diff.py",
         "model_training/mapping/merge.py",
         "model_training/mapping/tiled_care.py",
-        "model_training/mapping/update_tiled.py",
         "model_training/mapping/verify.py",
         STAGES,
         *CITY_ARCHIVES,

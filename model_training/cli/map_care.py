@@ -2,6 +2,8 @@
 
 import json
 import os
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -9,6 +11,7 @@ import typer
 from rich.console import Console
 
 from model_training.cli.progress import bars
+from model_training.cli.tile_options import EngineOption, WorkersOption, refuse_without_tiles
 from model_training.datasets.dataset import Dataset, require_map_first
 from model_training.mapping.build import describe
 from model_training.mapping.diff import diff_of, difference_png
@@ -20,7 +23,7 @@ from model_training.mapping.update_tiled import update_tiled
 from model_training.mapping.verify import damage_of
 from service.errors import BundleError
 from service.maps.calibration import RigCorrection
-from service.maps.manifest import read_manifest
+from service.maps.manifest import Manifest, read_manifest
 from service.maps.reader import MapBundle
 from service.maps.search_address import COLLECTION
 from service.maps.store.transfer import Copied
@@ -160,20 +163,29 @@ def update(
             help="Visibility vote between passes of the new survey: drop points that more passes see through than hit."
         ),
     ] = False,
+    engine: EngineOption = None,
+    workers: WorkersOption = None,
     overwrite: _Overwrite = False,
 ) -> None:
     """Add a survey to a map, or replace a rebuilt part.
 
-    The command uses the map's own encoder and settings.
+    The command uses the map's own encoder and settings. The same command resumes an update that was killed at any moment.
+    Only a tiled map takes --engine and --workers.
 
     \b
-    Example:
+    Examples:
       streetfix map update maps/town data/may --replace-area block.geojson --out maps/town-may
+      streetfix map update maps/town-tiled data/may --workers 4 --out maps/town-may
     """
     if replace and replace_area is not None:
         raise typer.BadParameter("give --replace or --replace-area, not both")
     require_map_first(bundle, dataset, "map update")
-    updating = update_tiled if read_manifest(bundle).tiles else update_map
+    updating: Callable[..., Manifest] = update_map
+    if read_manifest(bundle).tiles:
+        warn = partial(typer.echo, err=True)
+        updating = partial(update_tiled, engine=engine or "local", workers=workers, warn=warn)
+    else:
+        refuse_without_tiles(engine, workers, remedy=f"{bundle} is a map of one bundle, so omit the option")
     with bars() as report:
         made = updating(
             bundle,

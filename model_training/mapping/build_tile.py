@@ -27,7 +27,7 @@ from service.retrieval.encoder import Encoder
 #: Threads of a tile. More would change the order of sums, and with it the last bits. Tiles run side by side instead.
 THREADS = 1
 #: How long a tile waits for the process of an earlier attempt, seconds. It ends soon after its parent.
-_WAIT_S = 60.0
+WAIT_S = 60.0
 #: Share of each stage in the time of a tile, in order: 3,100 scans of a simulated city, one core.
 _SHARES = {"survey": 0.2, "places": 0.5, "site check": 0.05, "traffic": 0.1, "passes": 0.1, "writing": 0.05}
 
@@ -142,18 +142,14 @@ def build_tile(task: TileTask, share: Share = lambda _: None) -> None:
         EncoderError: the encoder cannot be used.
         BundleError: the bundle cannot be written, or this process sees other inputs than the one that planned the tiles.
     """
-    with threadpool_limits(limits=THREADS), work_beside(task.folder, task.key, wait_s=_WAIT_S) as work:
+    with threadpool_limits(limits=THREADS), work_beside(task.folder, task.key, wait_s=WAIT_S) as work:
         if task.is_finished:  # by an earlier attempt that this one has just waited for
             shutil.rmtree(task.scratch, ignore_errors=True)
             return
         dataset = task.dataset.part(task.numbers, task.poses, scratch=task.scratch)
         encoder = Encoder.open(task.encoder_file, threads=THREADS)
-        if key_of_tile(dataset, encoder.sha256, task.settings, task.part, task.common) != task.key:
-            raise BundleError(
-                f"{task.name}: this process reads other scans, another encoder or another release of streetfix than the process that "
-                "started the build; use one release and one shared folder on all machines, and do not change the dataset during the build",
-                field="dataset",
-            )
+        found = key_of_tile(dataset, encoder.sha256, task.settings, task.part, task.common)
+        require_planned(task.name, found, task.key, inputs="other scans, another encoder")
         calibration = calibration_for(task.settings.calibration, encoder.sha256)
         at_scan = np.flatnonzero(task.part.plan.at_scan)
         apart = set() if calibration is None else set(at_scan[sorted(held_out(len(at_scan)))].tolist())
@@ -180,6 +176,26 @@ def build_tile(task: TileTask, share: Share = lambda _: None) -> None:
             lidar_height_m=task.common.lidar_height_m,
         )
         dataset.release()
+
+
+def require_planned(tile: str, found: str, planned: str, *, inputs: str) -> None:
+    """Refuse a tile whose inputs are not those that it was planned with.
+
+    Args:
+        tile: name of the tile.
+        found: hash of all inputs, as the process of the tile finds it.
+        planned: the same hash, as the process that planned the tiles found it.
+        inputs: which inputs may differ, for the error.
+
+    Raises:
+        BundleError: the hashes differ.
+    """
+    if found != planned:
+        raise BundleError(
+            f"{tile}: this process reads {inputs} or another release of streetfix than the process that planned the tiles; use one "
+            "release and one shared folder on all machines, and do not change the dataset until the map is complete",
+            field="dataset",
+        )
 
 
 def shares_of_stages(settings: BuildSettings, share: Share) -> Callable[[str, int, int], None]:

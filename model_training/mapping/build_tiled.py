@@ -9,22 +9,19 @@ import numpy as np
 from model_training.datasets.dataset import Dataset
 from model_training.datasets.stored_survey import source_of
 from model_training.mapping.build import Report, require_new
-from model_training.mapping.build_tile import THREADS, CommonValues, TileTask, key_of_tile
+from model_training.mapping.build_tile import THREADS, CommonValues, TileTask, build_tile, key_of_tile
 from model_training.mapping.calibration_file import calibration_for
-from model_training.mapping.engines import run
+from model_training.mapping.engines import memory_of
 from model_training.mapping.settings import BuildSettings
 from model_training.mapping.survey import kept_scans, sampled_survey
+from model_training.mapping.tile_tasks import finish_tiles, folder_of, is_of_tile
 from model_training.mapping.tiles import require_tile_edge, tile_parts
-from model_training.mapping.work import BuildCache, key_of, remove, work_beside
+from model_training.mapping.work import BuildCache, key_of, work_beside
 from model_training.tasks.engines import Engine, require_engine
-from service.errors import BundleError
 from service.imaging.view_grid import ViewGrid
 from service.maps.manifest import Manifest
 from service.maps.tiled_writer import write_tiled
 from service.retrieval.encoder import Encoder
-
-#: Start of the name of a tile's folder among the parts of a build.
-TILE_PREFIX = "tile_"
 
 
 def build_tiled(
@@ -68,17 +65,19 @@ def build_tiled(
     require_engine(engine, workers)
     encoder = Encoder.open(encoder_file, threads=THREADS)
     calibration_for(settings.calibration, encoder.sha256)  # refuse a damaged file before the work
-    with work_beside(out, key_of(dataset, encoder.sha256, settings, threads=THREADS), also=_is_of_tile) as work:
+    with work_beside(out, key_of(dataset, encoder.sha256, settings, threads=THREADS), also=is_of_tile) as work:
         tasks = _tasks(dataset, encoder, encoder_file, settings, tile_m, work, report)
-        _remove_others(work, tasks)
-        left = [task for task in tasks if not task.is_finished]
-        progress = _Progress(tasks, left, report)
-        run(engine, left, workers=workers, on_progress=progress, warn=warn)
-        if unseen := [task.name for task in left if not task.is_finished]:
-            raise BundleError(
-                f"{unseen[0]}: the finished tile is not in {work.folder}; put --out on a folder that all machines share",
-                field="out",
-            )
+        finish_tiles(
+            engine,
+            tasks,
+            build_tile,
+            work,
+            memory_of=memory_of,
+            remedy="give fewer --workers or a smaller --tile-m",
+            workers=workers,
+            report=report,
+            warn=warn,
+        )
         report("joining tiles", 0, 1)
         tiles = {(task.part.square.column, task.part.square.row): task.folder for task in tasks}
         manifest = write_tiled(out, tiles, tile_m, name=settings.name, overwrite=overwrite)
@@ -112,7 +111,6 @@ def _tasks(
         source = source_of(dataset, numbers)
         of_tile = source.part(numbers, poses[numbers], scratch=dataset.folder)
         key = key_of_tile(of_tile, encoder.sha256, settings, part, common)
-        folder = work.folder / f"{TILE_PREFIX}{part.square.column}_{part.square.row}_{key}"
         tasks.append(
             TileTask(
                 source,
@@ -123,50 +121,8 @@ def _tasks(
                 part,
                 common,
                 key,
-                folder.resolve(),
+                folder_of(work, part.square, key),
             )
         )
         report("planning tiles", done + 1, len(parts))
     return tasks
-
-
-def _is_of_tile(name: str) -> bool:
-    """Return whether a name among the parts of a build is that of a tile, or of the parts of a tile."""
-    return name.removeprefix(".").startswith(TILE_PREFIX)
-
-
-def _remove_others(work: BuildCache, tasks: list[TileTask]) -> None:
-    """Remove the tiles of other inputs, and their parts."""
-    wanted = {task.folder.name for task in tasks}
-    for path in work.folder.iterdir():
-        if _is_of_tile(path.name) and not any(path.name.removeprefix(".").startswith(name) for name in wanted):
-            remove(path)
-
-
-class _Progress:
-    """Add up the progress of the tiles, in scans.
-
-    Args:
-        tasks: all tiles.
-        left: the tiles to build.
-        report: progress callback.
-    """
-
-    def __init__(self, tasks: list[TileTask], left: list[TileTask], report: Report) -> None:
-        self._scans = np.array([len(task.numbers) for task in left], np.float64)
-        self._shares = np.zeros(len(left))
-        self._total = sum(len(task.numbers) for task in tasks)
-        self._before = self._total - int(self._scans.sum())
-        self._stage = f"scans of {len(tasks)} tiles"
-        self._report = report
-        self._report(self._stage, self._before, self._total)
-
-    def __call__(self, index: int, share: float) -> None:
-        """Store the progress of a tile and report the sum.
-
-        Args:
-            index: index of the tile among those to build.
-            share: its finished share, 0 to 1.
-        """
-        self._shares[index] = max(share, self._shares[index])
-        self._report(self._stage, self._before + int(self._scans @ self._shares), self._total)

@@ -4,8 +4,13 @@ A tile's folder is its only result. A process that dies loses no finished tile a
 """
 
 from collections.abc import Callable, Sequence
+from functools import partial
+from typing import Protocol, TypeVar
 
-from model_training.mapping.build_tile import THREADS, Share, TileTask, build_tile
+import numpy as np
+from numpy.typing import NDArray
+
+from model_training.mapping.build_tile import THREADS, Share
 from model_training.tasks.engines import Engine, run_job
 from model_training.tasks.job import Job
 from model_training.tasks.local import workers_that_fit
@@ -21,25 +26,48 @@ _MAPPED_BYTES = 2 << 20
 OnProgress = Callable[[int, float], None]
 
 
+class Tile(Protocol):
+    """A tile to build or to update. It can be pickled."""
+
+    @property
+    def name(self) -> str:
+        """Name of the tile in messages."""
+        ...
+
+    @property
+    def numbers(self) -> NDArray[np.int64]:
+        """Indices of the scans that the tile reads (K,)."""
+        ...
+
+
+T = TypeVar("T", bound=Tile)
+
+
 def run(
     engine: Engine,
-    tasks: Sequence[TileTask],
+    tasks: Sequence[T],
+    do: Callable[[T, Share], None],
     *,
+    memory_of: Callable[[T], int],
+    remedy: str,
     workers: int | None,
     on_progress: OnProgress,
     warn: Callable[[str], None],
 ) -> None:
-    """Build all tiles.
+    """Build or update all tiles.
 
     Args:
         engine: ``local`` or ``ray``.
         tasks: the tiles.
+        do: builds or updates a tile, and reports its finished share. Other processes import it by its name.
+        memory_of: returns the memory that a process needs for a tile, bytes.
+        remedy: what helps if processes die or the memory is full, for the error.
         workers: number of processes; None takes as many as cores and memory allow, and on a cluster of Ray all of its cores.
         on_progress: called with the progress of each tile.
         warn: called with a line of text if a process dies.
 
     Raises:
-        StreetfixError: a tile cannot be built.
+        StreetfixError: a tile cannot be built or updated.
         BundleError: the process of a tile died in every attempt.
     """
     if not tasks:
@@ -48,11 +76,11 @@ def run(
         tasks,
         # The longest tile first, so that none of them runs alone at the end.
         order=sorted(range(len(tasks)), key=lambda index: -len(tasks[index].numbers)),
-        do=_build,
+        do=partial(_with_small_heap, do),
         name_of=lambda task: task.name,
         memory_of=memory_of,
         after_death="the tile goes on in another process",
-        remedy="give fewer --workers or a smaller --tile-m, and run the command again: it goes on with the unfinished tiles",
+        remedy=f"{remedy}, and run the command again: it goes on with the unfinished tiles",
         error=BundleError,
         on_done=lambda index: on_progress(index, 1.0),
         warn=warn,
@@ -61,8 +89,8 @@ def run(
     run_job(engine, job, workers, usual_workers=workers_that_fit(job))
 
 
-def memory_of(task: TileTask) -> int:
-    """Return the memory that a process needs for a tile, bytes: an upper estimate.
+def memory_of(task: Tile) -> int:
+    """Return the memory that a process needs for the scans of a tile, bytes: an upper estimate.
 
     Args:
         task: the tile.
@@ -70,6 +98,6 @@ def memory_of(task: TileTask) -> int:
     return PROCESS_BYTES + SCAN_BYTES * len(task.numbers)
 
 
-def _build(task: TileTask, share: Share) -> None:
+def _with_small_heap(do: Callable[[T, Share], None], task: T, share: Share) -> None:
     limit_heap(THREADS, mapped_bytes=_MAPPED_BYTES)
-    build_tile(task, share)
+    do(task, share)

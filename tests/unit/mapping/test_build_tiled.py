@@ -55,23 +55,23 @@ def files_of(folder):
     return found
 
 
-def in_this_process(_engine, tasks, *, on_progress, **_):
+def in_this_process(_engine, tasks, do, *, on_progress, **_):
     """Replace both engines, because processes take seconds to start."""
     for index, task in enumerate(tasks):
-        build_tile(task, partial(on_progress, index))
+        do(task, partial(on_progress, index))
         on_progress(index, 1.0)
 
 
 @pytest.fixture
 def serial(monkeypatch):
-    monkeypatch.setattr(driver, "run", in_this_process)
+    monkeypatch.setattr(engines, "run", in_this_process)
 
 
 @pytest.fixture(scope="module")
 def tiled(small_dataset, encoder_file, tmp_path_factory):
     out = tmp_path_factory.mktemp("tiled") / "m"
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(driver, "run", in_this_process)
+        patch.setattr(engines, "run", in_this_process)
         build_tiled(small_dataset, encoder_file, out, SETTINGS, tile_m=TILE_M)
     return out
 
@@ -90,11 +90,11 @@ def tasks_of(small_dataset, encoder_file, tmp_path, monkeypatch):
         found = []
         with monkeypatch.context() as patch:
 
-            def run(_engine, tasks, **_):
+            def run(_engine, tasks, _do, **_):
                 found.extend(tasks)
                 raise KilledError
 
-            patch.setattr(driver, "run", run)
+            patch.setattr(engines, "run", run)
             with pytest.raises(KilledError):
                 build_tiled(dataset, encoder_file, tmp_path / "planned", settings, tile_m=TILE_M)
         return found
@@ -179,18 +179,18 @@ def test_progress_counts_the_scans_of_all_tiles(small_dataset, encoder_file, ser
 def test_a_killed_build_goes_on_with_the_unfinished_tiles(
     small_dataset, encoder_file, undisturbed, serial, tmp_path, monkeypatch
 ):
-    def killed_after_one(engine, tasks, **options):
-        in_this_process(engine, tasks[:1], **options)
+    def killed_after_one(engine, tasks, do, **options):
+        in_this_process(engine, tasks[:1], do, **options)
         raise KeyboardInterrupt
 
     out, built = tmp_path / "m", []
     with monkeypatch.context() as patch:
-        patch.setattr(driver, "run", killed_after_one)
+        patch.setattr(engines, "run", killed_after_one)
         with pytest.raises(KeyboardInterrupt):
             build_tiled(small_dataset, encoder_file, out, SETTINGS, tile_m=TILE_M)
     assert not out.exists()
     monkeypatch.setattr(
-        driver, "run", lambda *args, **options: built.append(len(args[1])) or in_this_process(*args, **options)
+        engines, "run", lambda *args, **options: built.append(len(args[1])) or in_this_process(*args, **options)
     )
     build_tiled(small_dataset, encoder_file, out, SETTINGS, tile_m=TILE_M)
     assert built == [1]
@@ -332,17 +332,16 @@ def test_a_tile_whose_process_dies_again_and_again_stops_the_build(small_dataset
 
 
 def test_an_interrupted_build_ends_its_processes_and_can_go_on(
-    small_dataset, encoder_file, undisturbed, serial, tmp_path, monkeypatch
+    small_dataset, encoder_file, undisturbed, tmp_path, monkeypatch
 ):
     def report(stage, _done, _total):
         if stage.startswith("scans") and multiprocessing.active_children():
             raise KeyboardInterrupt
 
-    with monkeypatch.context() as patch:
-        patch.setattr(driver, "run", engines.run)
-        with pytest.raises(KeyboardInterrupt):
-            build_tiled(small_dataset, encoder_file, tmp_path / "m", SETTINGS, tile_m=TILE_M, workers=1, report=report)
+    with pytest.raises(KeyboardInterrupt):
+        build_tiled(small_dataset, encoder_file, tmp_path / "m", SETTINGS, tile_m=TILE_M, workers=1, report=report)
     assert multiprocessing.active_children() == []
+    monkeypatch.setattr(engines, "run", in_this_process)
     build_tiled(small_dataset, encoder_file, tmp_path / "m", SETTINGS, tile_m=TILE_M)
     assert files_of(tmp_path / "m") == undisturbed
 
@@ -424,7 +423,16 @@ def test_the_longest_tile_starts_first_and_no_more_tiles_than_fit_into_memory(ta
     monkeypatch.setattr(engines, "run_job", lambda _engine, job, workers, **usual: told.append((job, workers, usual)))
     for free in (largest // 2, largest, 2 * largest - 1, 2 * largest, 9 * largest):
         monkeypatch.setattr(local, "_free_bytes", lambda free=free: free)
-        engines.run("local", tasks, workers=None, on_progress=lambda *_: None, warn=lambda _: None)
+        engines.run(
+            "local",
+            tasks,
+            build_tile,
+            memory_of=engines.memory_of,
+            remedy="give fewer --workers",
+            workers=None,
+            on_progress=lambda *_: None,
+            warn=lambda _: None,
+        )
     assert [usual["usual_workers"] for _, _, usual in told] == [1, 1, 1, 2, 2]
     assert {workers for _, workers, _ in told} == {None}
     assert [list(job.order) for job, _, _ in told] == [[1, 0]] * 5

@@ -1,7 +1,14 @@
 """A tiled map gets a new survey: the tiles in its reach change as a bundle would, and the others stay the same files."""
 
+import importlib.util
 import json
+import multiprocessing
+import os
+import pickle
+import re
 import shutil
+import subprocess
+import sys
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -13,17 +20,17 @@ from typer.testing import CliRunner
 
 from model_training.cli.map_care import app
 from model_training.datasets.dataset import Dataset, scan_path, write_tum
-from model_training.mapping import build_tiled as driver
-from model_training.mapping.build_tile import build_tile
+from model_training.mapping import engines
 from model_training.mapping.build_tiled import build_tiled
 from model_training.mapping.join import of_places
 from model_training.mapping.settings import BuildSettings
 from model_training.mapping.stored_map import content_of, voxels_of
 from model_training.mapping.tiles import TILE_MARGIN_M, Square
-from model_training.mapping.update_tiled import _without_places, update_tiled
+from model_training.mapping.update_tile import SURFEL_BYTES, UpdateTask, _without_places, memory_of, update_tile
+from model_training.mapping.update_tiled import update_tiled
 from model_training.mapping.verify import damage_of
 from model_training.mapping.work import work_folder
-from service.errors import BundleError, DatasetError
+from service.errors import BundleError, DatasetError, ExtraMissingError
 from service.maps.manifest import read_manifest
 from service.maps.reader import MapBundle
 from service.maps.tiled_writer import write_tiled
@@ -34,7 +41,7 @@ SETTINGS = BuildSettings(
 )  # fmt: skip
 #: The street of 60 m lies in two tiles. One more tile is far from it.
 TILE_M, FAR = 50.0, (40, -7)
-WRITE = "model_training.mapping.update_tiled.write_bundle"
+WRITE = "model_training.mapping.update_tile.write_bundle"
 
 
 def written(
@@ -52,14 +59,21 @@ def written(
     return Dataset(folder)
 
 
-def in_this_process(_engine: str, tasks: Any, *, on_progress: Any, **_: Any) -> None:
+def in_this_process(_engine: str, tasks: Any, do: Any, *, on_progress: Any, **_: Any) -> None:
     for index, task in enumerate(tasks):
-        build_tile(task, partial(on_progress, index))
+        do(task, partial(on_progress, index))
+        on_progress(index, 1.0)
+
+
+@pytest.fixture
+def serial(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Replace both engines, because processes take seconds to start."""
+    monkeypatch.setattr(engines, "run", in_this_process)
 
 
 def built(dataset: Dataset, encoder: Path, out: Path, settings: BuildSettings = SETTINGS) -> Path:
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(driver, "run", in_this_process)
+        patch.setattr(engines, "run", in_this_process)
         build_tiled(dataset, encoder, out, settings, tile_m=TILE_M)
     return out
 
@@ -116,8 +130,9 @@ def xy(path: Path) -> np.ndarray:
     return places[np.lexsort(places.T)]
 
 
+@pytest.mark.usefixtures("serial")
 def test_the_second_half_makes_the_map_of_the_whole(half: Path, second: Dataset, whole: Path, tmp_path: Path) -> None:
-    made = update_tiled(half, second, tmp_path / "m", threads=1)
+    made = update_tiled(half, second, tmp_path / "m")
     assert damage_of(tmp_path / "m") == []
     expected, found = tiles(whole), tiles(tmp_path / "m")
     assert found.keys() == expected.keys() - {FAR}
@@ -128,12 +143,13 @@ def test_the_second_half_makes_the_map_of_the_whole(half: Path, second: Dataset,
     assert not work_folder(tmp_path / "m").exists()
 
 
+@pytest.mark.usefixtures("serial")
 def test_a_square_without_a_tile_gets_one(whole: Path, small_dataset: Dataset, second: Dataset, tmp_path: Path) -> None:
     """The old map has one of the two tiles of the street. The new tile has the points of the old survey in its margin too."""
     of_whole = tiles(whole)
     present, missing = sorted(of_whole.keys() - {FAR})
     write_tiled(tmp_path / "old", {present: of_whole[present], FAR: of_whole[FAR]}, TILE_M, name="town")
-    update_tiled(tmp_path / "old", small_dataset, tmp_path / "m", threads=1)
+    update_tiled(tmp_path / "old", small_dataset, tmp_path / "m")
     found = tiles(tmp_path / "m")
     assert found.keys() == of_whole.keys()
     np.testing.assert_allclose(xy(found[missing]), xy(of_whole[missing]), atol=1e-9)
@@ -144,8 +160,9 @@ def test_a_square_without_a_tile_gets_one(whole: Path, small_dataset: Dataset, s
     assert counted == MapBundle.open(of_whole[missing]).manifest.parameters["survey_scans"]
 
 
+@pytest.mark.usefixtures("serial")
 def test_tiles_out_of_reach_stay_the_same_files(whole: Path, second: Dataset, tmp_path: Path) -> None:
-    update_tiled(whole, second, tmp_path / "m", threads=1)
+    update_tiled(whole, second, tmp_path / "m")
     before, after = tiles(whole), tiles(tmp_path / "m")
     assert [square for square in before if before[square].name == after[square].name] == [FAR]
     one, other = (path[FAR] / "places.npy" for path in (before, after))
@@ -178,13 +195,14 @@ def standing_in(path: Path, standing: Any) -> list[int]:
     return found
 
 
+@pytest.mark.usefixtures("serial")
 def test_a_rebuilt_block_is_replaced_in_every_tile_that_sees_it(
     whole: Path, rebuilt: tuple[Dataset, Any], tmp_path: Path
 ) -> None:
     survey, standing = rebuilt
     before = standing_in(whole, standing)
-    update_tiled(whole, survey, tmp_path / "added", threads=1)
-    update_tiled(whole, survey, tmp_path / "replaced", replace_covered=True, threads=1)
+    update_tiled(whole, survey, tmp_path / "added")
+    update_tiled(whole, survey, tmp_path / "replaced", replace_covered=True)
     assert damage_of(tmp_path / "replaced") == []
     assert min(before) > 30
     for was, added, replaced in zip(
@@ -201,27 +219,48 @@ def polygon(path: Path, low: Any, high: Any) -> Path:
     return path
 
 
+@pytest.mark.usefixtures("serial")
 def test_a_polygon_empties_tiles_that_the_survey_does_not_reach(
     whole: Path, small_dataset: Dataset, second: Dataset, tmp_path: Path
 ) -> None:
     """The tile far away has one place, which the polygon holds. So this tile goes."""
     everything = polygon(tmp_path / "area.geojson", (-5000, -5000), (5000, 5000))
-    made = update_tiled(whole, second, tmp_path / "m", replace_area=everything, threads=1)
+    made = update_tiled(whole, second, tmp_path / "m", replace_area=everything)
     assert tiles(tmp_path / "m").keys() == tiles(whole).keys() - {FAR}
     assert made.counts.places == len(second.survey_poses())
 
 
+@pytest.mark.usefixtures("serial")
 def test_a_polygon_without_a_place_of_the_survey_is_refused(whole: Path, second: Dataset, tmp_path: Path) -> None:
     far = polygon(tmp_path / "area.geojson", (9000, 9000), (9100, 9100))
     with pytest.raises(DatasetError, match="no place of the new survey lies in the polygon"):
-        update_tiled(whole, second, tmp_path / "m", replace_area=far, threads=1)
+        update_tiled(whole, second, tmp_path / "m", replace_area=far)
     assert sorted(each.name for each in tmp_path.iterdir()) == ["area.geojson"]
 
 
+def files_of(path: Path) -> dict[str, bytes]:
+    """Return every file of a map; manifests without the time of the update."""
+    found = {str(p.relative_to(path)): p.read_bytes() for p in sorted(path.rglob("*")) if p.is_file()}
+    for name in [name for name in found if name.endswith("manifest.json")]:
+        manifest = json.loads(found[name])
+        del manifest["made_at"]
+        found[name] = json.dumps(manifest).encode()
+    return found
+
+
+@pytest.fixture(scope="module")
+def undisturbed(whole: Path, second: Dataset, folder: Path) -> dict[str, bytes]:
+    """The files of an update in this process, which nothing disturbed."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(engines, "run", in_this_process)
+        update_tiled(whole, second, folder / "undisturbed")
+    return files_of(folder / "undisturbed")
+
+
+@pytest.mark.usefixtures("serial")
 def test_a_killed_update_keeps_its_finished_tiles(
-    whole: Path, second: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    whole: Path, second: Dataset, undisturbed: dict[str, bytes], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    expected = update_tiled(whole, second, tmp_path / "expected", threads=1)
     written_tiles: list[Path] = []
 
     def dying(path: Path, *arguments: Any) -> Any:
@@ -232,18 +271,190 @@ def test_a_killed_update_keeps_its_finished_tiles(
 
     monkeypatch.setattr(WRITE, dying)
     with pytest.raises(KeyboardInterrupt):
-        update_tiled(whole, second, tmp_path / "m", threads=1)
+        update_tiled(whole, second, tmp_path / "m")
     assert not (tmp_path / "m").exists()
     first = written_tiles.copy()
     written_tiles.clear()
     monkeypatch.setattr(WRITE, lambda path, *rest: written_tiles.append(path) or write_bundle(path, *rest))
-    made = update_tiled(whole, second, tmp_path / "m", threads=1)
+    told: list[Any] = []
+    update_tiled(whole, second, tmp_path / "m", report=lambda *event: told.append(event))
     assert len(written_tiles) == 1  # of two changed tiles
     assert written_tiles != first
-    assert made.version == expected.version
+    assert files_of(tmp_path / "m") == undisturbed
     assert not work_folder(tmp_path / "m").exists()
+    # Each of the two tiles reads all scans, and one tile was finished.
+    scans, done = len(second.survey_poses()), [event[1] for event in told if event[0] == "scans of 2 tiles"]
+    assert (done[0], done[-1]) == (scans, 2 * scans)
+    assert done == sorted(done)
 
 
+def test_processes_give_the_same_bytes_although_one_is_killed(
+    whole: Path, second: Dataset, undisturbed: dict[str, bytes], tmp_path: Path
+) -> None:
+    """The parent kills a process at its first report. A second one continues the tile."""
+    killed: list[Any] = []
+    said: list[str] = []
+
+    def report(stage: str, *_: int) -> None:
+        if stage.startswith("scans") and not killed and multiprocessing.active_children():
+            killed.append(multiprocessing.active_children()[0])
+            killed[0].kill()
+
+    update_tiled(whole, second, tmp_path / "m", workers=2, report=report, warn=said.append)
+    assert files_of(tmp_path / "m") == undisturbed
+    assert len(killed) == len(said) == 1
+    assert re.match(
+        r"tile -?\d, -?\d: its process was killed by SIGKILL .*; the tile goes on in another process", said[0]
+    )
+
+
+def test_an_interrupted_update_ends_its_process_and_can_go_on(
+    whole: Path, second: Dataset, undisturbed: dict[str, bytes], tmp_path: Path
+) -> None:
+    """Ctrl-C comes while the only worker is at its second tile."""
+    out, scans = tmp_path / "m", len(second.survey_poses())
+
+    def report(stage: str, done: int, _total: int) -> None:
+        if stage.startswith("scans") and done >= scans and multiprocessing.active_children():
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        update_tiled(whole, second, out, workers=1, report=report)
+    assert multiprocessing.active_children() == []
+    assert not out.exists()
+    update_tiled(whole, second, out, workers=1)
+    assert files_of(out) == undisturbed
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["m"]
+
+
+@pytest.mark.skipif(importlib.util.find_spec("ray") is None, reason="needs the extra `ray`")
+def test_ray_gives_the_same_bytes(whole: Path, second: Dataset, undisturbed: dict[str, bytes], tmp_path: Path) -> None:
+    command = [sys.executable, "-c", "from service.cli.start import main; main()", "map", "update", str(whole)]
+    command += [str(second.folder), "--out", str(tmp_path / "m"), "--engine", "ray", "--workers", "2"]
+    environment = {name: value for name, value in os.environ.items() if name != "RAY_ADDRESS"}
+    done = subprocess.run(command, capture_output=True, text=True, env=environment, timeout=600, check=False)
+    assert done.returncode == 0, done.stderr
+    assert files_of(tmp_path / "m") == undisturbed
+
+
+@pytest.fixture
+def tasks_of(whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Any:
+    """Return the planned tiles of an update that does not begin them."""
+
+    def planned(dataset: Dataset, old: Path = whole) -> list[UpdateTask]:
+        found: list[UpdateTask] = []
+
+        def run(_engine: str, tasks: Any, *_: Any, **__: Any) -> None:
+            found.extend(tasks)
+            raise KeyboardInterrupt
+
+        with monkeypatch.context() as patch:
+            patch.setattr(engines, "run", run)
+            with pytest.raises(KeyboardInterrupt):
+                update_tiled(old, dataset, tmp_path / "planned")
+        return found
+
+    return planned
+
+
+def test_a_task_can_be_sent_to_another_process(second: Dataset, tasks_of: Any) -> None:
+    task = tasks_of(second)[0]
+    again = pickle.loads(pickle.dumps(task))  # noqa: S301  # of this test
+    assert (again.key, again.folder, again.name) == (task.key, task.folder, task.name)
+    assert again.update.key() == task.key
+    assert all(path.is_absolute() for path in (task.update.old, task.update.dataset, task.folder))
+
+
+def test_a_process_that_sees_other_scans_refuses_the_tile(second: Dataset, tasks_of: Any, tmp_path: Path) -> None:
+    own = Dataset(shutil.copytree(second.folder, tmp_path / "own"))
+    task = tasks_of(own)[0]
+    os.utime(scan_path(own.folder, 0), ns=(1, 1))
+    with pytest.raises(
+        BundleError, match=r"tile -?\d, -?\d: this process reads other scans, another map.*do not change"
+    ):
+        update_tile(task)
+    assert not task.is_finished
+
+
+def test_the_encoder_has_one_thread_whatever_the_machine_has(
+    second: Dataset, tasks_of: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class StoppedError(Exception):
+        pass
+
+    def opened(_: bytes, *, threads: int) -> Any:
+        asked.append(threads)
+        raise StoppedError
+
+    task, asked = tasks_of(second)[0], list[int]()
+    monkeypatch.setattr(os, "cpu_count", lambda: 64)
+    monkeypatch.setattr("model_training.mapping.update_tile.Encoder.open", opened)
+    with pytest.raises(StoppedError):
+        update_tile(task)
+    assert asked == [1]
+
+
+def test_a_process_needs_memory_for_its_scans_and_for_the_voxels_of_the_old_tile(
+    whole: Path, small_dataset: Dataset, second: Dataset, tasks_of: Any, tmp_path: Path
+) -> None:
+    """A new tile reads the tiles around it one after the other. The largest of them counts."""
+    surfels = {square: read_manifest(tile).counts.cloud_points for square, tile in tiles(whole).items()}
+    for task in tasks_of(second):
+        square = task.update.part.square
+        expected = engines.PROCESS_BYTES + len(second.survey_poses()) * engines.SCAN_BYTES
+        assert memory_of(task) == expected + SURFEL_BYTES * surfels[square.column, square.row]
+    present, missing = sorted(surfels.keys() - {FAR})
+    write_tiled(tmp_path / "old", {present: tiles(whole)[present], FAR: tiles(whole)[FAR]}, TILE_M, name="town")
+    new = {
+        (task.update.part.square.column, task.update.part.square.row): task
+        for task in tasks_of(small_dataset, tmp_path / "old")
+    }
+    expected = engines.PROCESS_BYTES + len(small_dataset.survey_poses()) * engines.SCAN_BYTES
+    assert memory_of(new[missing]) == expected + SURFEL_BYTES * surfels[present]
+
+
+@pytest.mark.usefixtures("serial")
+def test_a_tile_that_lost_all_places_is_finished_too(
+    whole: Path, second: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The update is killed after its last tile, while it joins the tiles."""
+    everything = polygon(tmp_path / "area.geojson", (-5000, -5000), (5000, 5000))
+    begun: list[int] = []
+
+    def killed(*_: Any, **__: Any) -> None:
+        raise KeyboardInterrupt
+
+    def counting(engine: str, tasks: Any, do: Any, **options: Any) -> None:
+        begun.append(len(tasks))
+        in_this_process(engine, tasks, do, **options)
+
+    monkeypatch.setattr(engines, "run", counting)
+    with monkeypatch.context() as patch:
+        patch.setattr("model_training.mapping.update_tiled.write_tiled", killed)
+        with pytest.raises(KeyboardInterrupt):
+            update_tiled(whole, second, tmp_path / "m", replace_area=everything)
+    update_tiled(whole, second, tmp_path / "m", replace_area=everything)
+    assert begun == [3, 0]
+    assert FAR not in tiles(tmp_path / "m")
+
+
+def test_an_engine_that_cannot_run_is_refused_before_the_work(
+    whole: Path, second: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def update(**options: Any) -> None:
+        update_tiled(whole, second, tmp_path / "m", report=lambda *_: pytest.fail("it began"), **options)
+
+    with pytest.raises(DatasetError, match="engine: 'slurm' is unknown; give local or ray"):
+        update(engine="slurm")
+    with pytest.raises(DatasetError, match="workers: 0 is not valid; give 1 or more"):
+        update(workers=0)
+    monkeypatch.setitem(sys.modules, "ray", None)
+    with pytest.raises(ExtraMissingError, match=r"--engine ray needs the package 'ray': .*\[ray\]"):
+        update(engine="ray")
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.usefixtures("serial")
 def test_tiles_of_other_options_are_not_taken(
     whole: Path, second: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -262,17 +473,18 @@ def test_tiles_of_other_options_are_not_taken(
     (changed / "streets.geojson").write_text(json.dumps(streets))
     for dataset, vote in ((second, False), (second, True), (Dataset(changed), True)):
         with pytest.raises(KeyboardInterrupt):
-            update_tiled(whole, dataset, tmp_path / "m", passes_vote=vote, threads=1)
+            update_tiled(whole, dataset, tmp_path / "m", passes_vote=vote)
     assert len(set(written_tiles)) == 3
 
 
+@pytest.mark.usefixtures("serial")
 def test_the_usual_settings_work_on_tiles_too(
     first: Dataset, second: Dataset, encoder_file: Path, tmp_path: Path
 ) -> None:
     """Alignment, traffic vote, places between scans and the vote of passes."""
     usual = BuildSettings(name="town", headings=6, spacing_m=5.0, voxel_m=0.6, calibration=None)
     built(first, encoder_file, tmp_path / "old", usual)
-    made = update_tiled(tmp_path / "old", second, tmp_path / "m", passes_vote=True, threads=1)
+    made = update_tiled(tmp_path / "old", second, tmp_path / "m", passes_vote=True)
     assert damage_of(tmp_path / "m") == []
     assert made.counts.places > read_manifest(tmp_path / "old").counts.places
     assert made.parameters["traffic_vote"] == made.parameters["survey_aligned"] == 1.0
@@ -288,6 +500,7 @@ def test_a_new_tile_does_not_take_over_the_site_check_of_another(whole: Path, ca
 
 
 @pytest.mark.parametrize(("name", "values"), [("voxel_m", (0.6, 0.3)), ("between_m", (0.0, 3.0))])
+@pytest.mark.usefixtures("serial")
 def test_tiles_of_different_settings_are_refused(
     whole: Path, second: Dataset, tmp_path: Path, name: str, values: tuple[float, float]
 ) -> None:
@@ -297,10 +510,11 @@ def test_tiles_of_different_settings_are_refused(
         write_bundle(tmp_path / f"{k}", replace(content, parameters=parameters))
     write_tiled(tmp_path / "old", {(k, 0): tmp_path / f"{k}" for k in range(2)}, TILE_M, name="town")
     with pytest.raises(BundleError, match=f"its tiles have different {name}") as refused:
-        update_tiled(tmp_path / "old", second, tmp_path / "m", threads=1)
+        update_tiled(tmp_path / "old", second, tmp_path / "m")
     assert refused.value.field == name
 
 
+@pytest.mark.usefixtures("serial")
 def test_a_street_that_contradicts_the_maps_is_refused_before_the_work(
     whole: Path, second: Dataset, tmp_path: Path
 ) -> None:
@@ -321,9 +535,41 @@ def test_a_street_that_contradicts_the_maps_is_refused_before_the_work(
     assert told == []
 
 
+@pytest.mark.usefixtures("serial")
 def test_the_command_updates_a_tiled_map(whole: Path, second: Dataset, tmp_path: Path) -> None:
     found = CliRunner().invoke(app, ["update", str(whole), str(second.folder), "--out", str(tmp_path / "m")])
     assert found.exit_code == 0, found.output
     assert "map town" in found.output
     again = CliRunner().invoke(app, ["diff", str(whole), str(tmp_path / "m")])
     assert "2 changed, 1 kept" in again.output
+
+
+def test_the_options_of_the_command_reach_the_engine(
+    whole: Path, second: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked: list[Any] = []
+
+    def run(engine: str, tasks: Any, do: Any, *, workers: int | None, warn: Any, **options: Any) -> None:
+        asked.append((engine, workers))
+        warn("tile 1, 2: its process died")
+        in_this_process(engine, tasks, do, **options)
+
+    monkeypatch.setattr(engines, "run", run)
+    arguments = ["update", str(whole), str(second.folder), "--out", str(tmp_path / "m")]
+    found = CliRunner().invoke(app, [*arguments, "--engine", "local", "--workers", "3"])
+    assert found.exit_code == 0, found.output
+    assert asked == [("local", 3)]
+    assert "tile 1, 2: its process died" in found.stderr
+
+
+@pytest.mark.parametrize("option", [("--workers", "2"), ("--engine", "local")])
+def test_the_command_refuses_options_of_tiles_for_a_map_of_one_bundle(
+    whole: Path, second: Dataset, tmp_path: Path, option: tuple[str, str]
+) -> None:
+    bundle = tiles(whole)[FAR]
+    found = CliRunner().invoke(app, ["update", str(bundle), str(second.folder), "--out", str(tmp_path / "m"), *option])
+    assert found.exit_code == 2
+    said = " ".join(found.output.split())
+    assert f"Invalid value for {option[0]}: it builds tiles;" in said
+    assert "is a map of one bundle, so omit the option" in said
+    assert list(tmp_path.iterdir()) == []
