@@ -65,7 +65,7 @@ test-service: .venv/.dev ## the tests of the service, without torch and the simu
 test-ray: .venv/.torch ## tiled maps and training cities on a Ray cluster whose workers, node and driver are killed; installs the extra `ray`
 	$(INSTALL) 'ray>=2.50,<3'
 	$(BIN)/python -m pytest tests/unit/mapping/test_ray_cluster.py tests/unit/mapping/test_build_tiled.py \
-		tests/unit/training/test_ray_cities.py -k ray $(ARGS)
+		tests/unit/mapping/test_update_tiled.py tests/unit/training/test_ray_cities.py -k ray $(ARGS)
 
 check: .venv/.torch ## lint, types, layers, and whether the contracts equal the code
 	$(BIN)/ruff check

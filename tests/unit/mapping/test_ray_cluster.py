@@ -1,4 +1,7 @@
-"""Builds on a Ray cluster of two nodes, whose workers, node and driver are killed. Needs the extra ``ray`` (``make test-ray``)."""
+"""Builds and an update on a Ray cluster of two nodes, whose workers, node and driver are killed.
+
+Needs the extra ``ray`` (``make test-ray``).
+"""
 
 import json
 import os
@@ -16,7 +19,7 @@ from tests.unit.ray_nodes import require_survival, running_tasks, until
 
 ray = pytest.importorskip("ray", reason="needs the extra `ray`")
 
-BUILD = "from service.cli.start import main; main()"
+COMMAND = "from service.cli.start import main; main()"
 TILE_M = 50
 
 
@@ -31,27 +34,13 @@ def files_of(folder: Path) -> dict[str, bytes]:
 
 
 @pytest.fixture
-def start(ray_cluster: Any, small_dataset: Any, encoder_file: Path, tmp_path: Path) -> Iterator[Callable[..., Any]]:
-    """Return what starts a build as a user does, in a process of its own."""
+def command(ray_cluster: Any) -> Iterator[Callable[..., Any]]:
+    """Return what starts a command as a user does, in a process of its own."""
     started: list[subprocess.Popen[str]] = []
 
-    def build(name: str, engine: str = "ray", survey: str = str(small_dataset.folder)) -> "subprocess.Popen[str]":
-        command = [sys.executable, "-c", BUILD, "build-map", survey, "--out", str(tmp_path / name)]
-        command += [
-            "--encoder",
-            str(encoder_file),
-            "--name",
-            "tiled",
-            "--headings",
-            "6",
-            "--spacing",
-            "5",
-            "--voxel",
-            "0.6",
-        ]
-        command += ["--tile-m", str(TILE_M), "--engine", engine, "--workers", "2"]
+    def start(*arguments: str) -> "subprocess.Popen[str]":
         process = subprocess.Popen(
-            command,
+            [sys.executable, "-c", COMMAND, *arguments],
             env=os.environ | {"RAY_ADDRESS": ray_cluster.address},
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
@@ -60,10 +49,25 @@ def start(ray_cluster: Any, small_dataset: Any, encoder_file: Path, tmp_path: Pa
         started.append(process)
         return process
 
-    yield build
+    yield start
     for process in started:
         process.kill()
         process.communicate()
+
+
+@pytest.fixture
+def start(command: Callable[..., Any], small_dataset: Any, encoder_file: Path, tmp_path: Path) -> Callable[..., Any]:
+    """Return what starts a build."""
+
+    def build(name: str, engine: str = "ray", survey: str = str(small_dataset.folder)) -> "subprocess.Popen[str]":
+        settings = ["--name", "tiled", "--headings", "6", "--spacing", "5", "--voxel", "0.6", "--tile-m", str(TILE_M)]
+        files = ["--out", str(tmp_path / name), "--encoder", str(encoder_file)]
+        process: subprocess.Popen[str] = command(
+            "build-map", survey, *files, *settings, "--engine", engine, "--workers", "2"
+        )
+        return process
+
+    return build
 
 
 @pytest.fixture
@@ -108,3 +112,17 @@ def test_the_nodes_fetch_a_survey_from_object_storage(
     assert process.returncode == 0, said
     assert files_of(tmp_path / "m") == undisturbed
     assert sorted(path.name for path in tmp_path.iterdir()) == ["local", "m"]
+
+
+@pytest.mark.usefixtures("undisturbed")
+def test_an_update_survives_a_killed_worker_and_a_lost_node(
+    ray_cluster: Any, command: Callable[..., Any], small_dataset: Any, tmp_path: Path
+) -> None:
+    """The survey of the map takes the place of its content, so both tiles change."""
+    update = ["map", "update", str(tmp_path / "local"), str(small_dataset.folder), "--replace", "--workers", "2"]
+    process = command(*update, "--engine", "local", "--out", str(tmp_path / "expected"))
+    _, said = process.communicate(timeout=300)
+    assert process.returncode == 0, said
+    require_survival(ray_cluster, command(*update, "--engine", "ray", "--out", str(tmp_path / "m")))
+    assert files_of(tmp_path / "m") == files_of(tmp_path / "expected")
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["expected", "local", "m"]
