@@ -17,14 +17,14 @@ from model_training.datasets.dataset import Dataset, write_tum
 from model_training.datasets.frames import global_frame
 from model_training.datasets.stored_survey import dataset_at
 from model_training.evaluation.evaluate import evaluate
-from model_training.mapping import build_tiled as driver
+from model_training.mapping import engines
 from model_training.mapping.build import build_map
-from model_training.mapping.build_tile import build_tile
 from model_training.mapping.build_tiled import build_tiled
 from model_training.mapping.frame_choice import in_chosen_frame
 from model_training.mapping.merge import merge_maps
 from model_training.mapping.settings import BuildSettings
 from model_training.mapping.update import update_map
+from model_training.mapping.update_tiled import update_tiled
 from service.errors import BundleError, DatasetError
 from service.geometry.earth import Georeference
 from service.maps.manifest import read_manifest
@@ -76,27 +76,30 @@ def places(path: Path) -> np.ndarray:
 def test_tiles_of_two_surveys_are_the_same_squares_of_the_global_frame(
     surveys: Any, encoder_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def in_this_process(_engine: str, tasks: Any, *, on_progress: Any, **_: Any) -> None:
+    def in_this_process(_engine: str, tasks: Any, do: Any, *, on_progress: Any, **_: Any) -> None:
         for index, task in enumerate(tasks):
-            build_tile(task, partial(on_progress, index))
+            do(task, partial(on_progress, index))
 
-    monkeypatch.setattr(driver, "run", in_this_process)
+    monkeypatch.setattr(engines, "run", in_this_process)
     for survey in surveys:
         moved = in_chosen_frame(survey, None, tiled=True)
         build_tiled(moved, encoder_file, tmp_path / survey.folder.name, SETTINGS, tile_m=50.0)
-    first, second = (read_manifest(tmp_path / survey.folder.name) for survey in surveys)
-    assert first.georeference == second.georeference == asdict(ORIGIN)
-    assert [(each.column, each.row) for each in first.tiles] == [(each.column, each.row) for each in second.tiles]
+    update_tiled(tmp_path / "ulm", surveys[1], tmp_path / "updated")
+    first, *others = (read_manifest(tmp_path / name) for name in ("ulm", "neu_ulm", "updated"))
+    assert first.georeference == asdict(ORIGIN)
     # 0.02 degrees of longitude are 1,481 m at this latitude. The street reaches 30 m to both sides.
     assert {each.column for each in first.tiles} == {-31, -30}
-    for one, other in zip(first.tiles, second.tiles, strict=True):
-        bundles = [
-            MapBundle.open(tmp_path / survey.folder.name / tile.folder)
-            for survey, tile in zip(surveys, (one, other), strict=True)
-        ]
-        np.testing.assert_allclose(bundles[0].T_map_place, bundles[1].T_map_place, atol=1e-5)
-        assert bundles[0].streets is not None
-        assert bundles[0].place_street.tolist() == bundles[1].place_street.tolist()
+    for other in others:
+        assert other.georeference == first.georeference
+        for one, same in zip(first.tiles, other.tiles, strict=True):
+            assert (one.column, one.row) == (same.column, same.row)
+    for name, other in zip(("neu_ulm", "updated"), others, strict=True):
+        for one, same in zip(first.tiles, other.tiles, strict=True):
+            bundles = MapBundle.open(tmp_path / "ulm" / one.folder), MapBundle.open(tmp_path / name / same.folder)
+            # An update adds no place, because every place of its survey has an old place beside it.
+            np.testing.assert_allclose(bundles[0].T_map_place, bundles[1].T_map_place, atol=1e-5)
+            assert bundles[0].streets is not None
+            assert bundles[0].place_street.tolist() == bundles[1].place_street.tolist()
 
 
 def test_a_map_in_the_frame_of_another_one_merges_with_it(

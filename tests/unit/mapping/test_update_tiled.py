@@ -362,7 +362,7 @@ def test_a_task_can_be_sent_to_another_process(second: Dataset, tasks_of: Any) -
     again = pickle.loads(pickle.dumps(task))  # noqa: S301  # of this test
     assert (again.key, again.folder, again.name) == (task.key, task.folder, task.name)
     assert again.update.key() == task.key
-    assert all(path.is_absolute() for path in (task.update.old, task.update.dataset, task.folder))
+    assert all(path.is_absolute() for path in (task.update.old, task.update.source.folder, task.folder))
 
 
 def test_a_process_that_sees_other_scans_refuses_the_tile(second: Dataset, tasks_of: Any, tmp_path: Path) -> None:
