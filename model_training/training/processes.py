@@ -22,9 +22,9 @@ import torch
 import torch.distributed as dist
 from numpy.typing import NDArray
 from torch import Tensor
-from torch.distributed import PrefixStore, ProcessGroupGloo, Store, TCPStore  # type: ignore[attr-defined]  # torch documents them
+from torch.distributed import PrefixStore, Store, TCPStore  # type: ignore[attr-defined]  # torch documents them
 
-from model_training.training.watch import LOST_AFTER_S, Watch
+from model_training.training.watch import Watch, connect
 from service.errors import DatasetError, StreetfixError
 
 #: Longest time from the start of a process to that of the last one, seconds. Packages on a network drive load slowly.
@@ -209,10 +209,10 @@ def joined(place: torch.device) -> Iterator[Processes]:
     local_count = int(os.environ["LOCAL_WORLD_SIZE"])
     store, failed = _store_of_start(rank, count), True
     # First the watch: a process that is lost now would keep the others waiting in ``init_process_group``.
-    watched = ProcessGroupGloo(PrefixStore("watch", store), rank, count, timedelta(seconds=LOST_AFTER_S))
-    watch = Watch(watched, _end)
+    connections = connect(store, rank, count, os.environ["MASTER_ADDR"], within_s=START_WITHIN_S)
+    watch = Watch(connections, _end)
     try:
-        dist.init_process_group("gloo", store=PrefixStore("work", store), rank=rank, world_size=count)
+        dist.init_process_group("gloo", store=store, rank=rank, world_size=count)
         seen: list[Any] = [None] * count
         dist.all_gather_object(seen, (place.type, torch.cuda.device_count(), local_count, socket.gethostname()))
         require_devices(seen)

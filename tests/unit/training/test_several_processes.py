@@ -10,6 +10,7 @@ from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -20,6 +21,7 @@ from torch._C._distributed_c10d import HashStore  # noqa: E402  # after the skip
 
 from benchmarks.loss_curve import loss_gap  # noqa: E402
 from benchmarks.provenance import ROOT  # noqa: E402
+from model_training.training import processes  # noqa: E402
 from model_training.training.augment import Augmenter  # noqa: E402
 from model_training.training.batches import City  # noqa: E402
 from model_training.training.loop import (  # noqa: E402
@@ -167,6 +169,18 @@ def test_a_restart_uses_a_new_name_although_the_store_keeps_the_old_one():
 def test_a_process_that_does_not_start_is_named():
     with pytest.raises(DatasetError, match=r"processes \[1\] of 2 did not start within 0 s"):
         name_of_start(HashStore(), 0, 2, limit_s=0.1)
+
+
+def test_a_process_that_has_lost_another_one_says_why_and_ends_its_simulations(monkeypatch, capsys):
+    ended = []
+    simulating = SimpleNamespace(terminate=lambda: ended.append("simulating"))
+    monkeypatch.setattr(processes.multiprocessing, "active_children", lambda: [simulating])
+    monkeypatch.setattr(processes.os, "_exit", ended.append)
+    processes._end("another training process has failed")
+    assert ended == ["simulating", 1]
+    assert capsys.readouterr().err.startswith(
+        "streetfix: another training process has failed; this process ends, and torchrun"
+    )
 
 
 @pytest.mark.parametrize(("pairs", "shards"), [(24, 2), (23, 3), (7, 3)])
