@@ -174,8 +174,8 @@ def test_a_process_that_does_not_start_is_named():
 def test_a_process_that_has_lost_another_one_says_why_and_ends_its_simulations(monkeypatch, capsys):
     ended = []
     simulating = SimpleNamespace(terminate=lambda: ended.append("simulating"))
-    monkeypatch.setattr(processes.multiprocessing, "active_children", lambda: [simulating])
-    monkeypatch.setattr(processes.os, "_exit", ended.append)
+    monkeypatch.setattr("multiprocessing.active_children", lambda: [simulating])
+    monkeypatch.setattr("os._exit", ended.append)
     processes._end("another training process has failed")
     assert ended == ["simulating", 1]
     assert capsys.readouterr().err.startswith(
