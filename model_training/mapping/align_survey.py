@@ -100,8 +100,7 @@ def _align_once(scans: list[Stored], now: Poses, given: Poses, report: Callable[
         return
     cloud = SurfelMap.prepare(voxels.origin, surfels, brightness)
     for k, stored in enumerate(scans):
-        points = _in_metres(stored)
-        common = points[_are_of(voxels.keys_of(_placed(points, now[k])), shared)]
+        common = _in_metres(stored).compress(shared[k], axis=0)
         if len(common) >= FEWEST:
             now[k] = _registered(cloud, common, now[k], given[k])
         report(k + 1)
@@ -114,10 +113,10 @@ def _thinned(points: Points, number: int) -> Points:
     run draws the same points (Efraimidis and Spirakis, Information Processing Letters 97, 2006).
     """
     range_m = lengths(points)
-    points, range_m = (each[(range_m > NEAREST_M) & (range_m < REACH_M)] for each in (points, range_m))
+    points, range_m = (each.compress((range_m > NEAREST_M) & (range_m < REACH_M), axis=0) for each in (points, range_m))
     if len(points) > POINTS:
         waiting = np.random.default_rng(number).standard_exponential(len(points), np.float32) / range_m
-        points = points[np.sort(np.argpartition(waiting, POINTS)[:POINTS])]
+        points = points.take(np.sort(np.argpartition(waiting, POINTS)[:POINTS]), axis=0)
     return np.ascontiguousarray(points, np.float32)
 
 
@@ -129,34 +128,29 @@ def _placed(points: Points, T: NDArray[np.float64]) -> NDArray[np.float64]:
     return transform_points(T, points.astype(np.float64))
 
 
-def _map_of(scans: list[Stored], poses: Poses) -> tuple[VoxelMap, NDArray[np.int64]]:
-    """Build the voxel map of all scans; return it with the sorted keys of the voxels that hold points of more than one scan.
+def _map_of(scans: list[Stored], poses: Poses) -> tuple[VoxelMap, list[NDArray[np.bool_]]]:
+    """Build the voxel map of all scans; return it with, for each scan, whether each point shares its voxel with another scan.
 
-    Only these voxels take part in registration. On a surface that no other scan has seen, a scan matches itself. There the rounding of
+    Only these points take part in registration. On a surface that no other scan has seen, a scan matches itself. There the rounding of
     the map would make its pose drift.
     """
     voxels = VoxelMap(VOXEL_M, lattice_origin(VOXEL_M, poses[:, :3, 3].mean(axis=0)))
-    keys, several = list[NDArray[np.int64]](), list[NDArray[np.bool_]]()
+    groups = []
     for first in range(0, len(scans), _TOGETHER):
         some = zip(scans[first:][:_TOGETHER], poses[first:], strict=False)
         placed = [_placed(_in_metres(stored), T) for stored, T in some]
-        points = np.concatenate(placed)
-        voxels.add(points)
-        of_points, scan = voxels.keys_of(points), np.repeat(np.arange(len(placed)), [len(each) for each in placed])
-        order = np.argsort(of_points, kind="stable")  # within a voxel in the order of the scans
-        found, start, count = np.unique(of_points[order], return_index=True, return_counts=True)
-        keys.append(found)
-        several.append(scan[order[start]] != scan[order[start + count - 1]])
-    found, times = np.unique(np.concatenate(keys), return_counts=True)
-    in_one_group = np.concatenate([each[are] for each, are in zip(keys, several, strict=True)])
-    return voxels, np.union1d(found[times > 1], in_one_group)
-
-
-def _are_of(keys: NDArray[np.int64], some: NDArray[np.int64]) -> NDArray[np.bool_]:
-    """Return for each key whether the sorted array ``some`` contains it."""
-    at = np.minimum(np.searchsorted(some, keys), max(len(some) - 1, 0))
-    found: NDArray[np.bool_] = some[at] == keys if len(some) else np.zeros(len(keys), bool)
-    return found
+        source = np.repeat(np.arange(len(placed)), [len(each) for each in placed])
+        groups.append(voxels.add_from(np.concatenate(placed), source))
+    found, times = np.unique(np.concatenate([keys for keys, _, _ in groups]), return_counts=True)
+    of_several = times > 1
+    for keys, in_group, _ in groups:
+        of_several[np.searchsorted(found, keys[in_group])] = True
+    shared = list[NDArray[np.bool_]]()
+    for number, (keys, _, row_of) in enumerate(groups):
+        points = of_several[np.searchsorted(found, keys)][row_of]
+        counts = [len(each) for each in scans[number * _TOGETHER :][:_TOGETHER]]
+        shared += np.split(points, np.cumsum(counts)[:-1])
+    return voxels, shared
 
 
 def _registered(
@@ -166,7 +160,7 @@ def _registered(
     state["R"], state["t"] = T[:3, :3], T[:3, 3] - cloud.origin_m
     state["anchor"], state["up"] = T_given[:3, 3] - cloud.origin_m, T_given[:3, 2]
     one = np.ones(len(points), np.float32)
-    ray = points / lengths(points)[:, None]
+    ray = (points.T / lengths(points)).T  # NumPy is slow for rows of three
     measured = QueryPoints(points, ray, np.float32(SIGMA_M) * one, one, 0 * one)
     align(cloud.grid, cloud.surfels, measured, state, _SOLVER)
     found = np.eye(4)

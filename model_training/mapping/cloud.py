@@ -33,7 +33,7 @@ def near(
         points: x, y, z (metres, frame of the LiDAR or its level frame) and intensity (n, 4).
         T_map_points: pose of the frame of the points (4, 4).
     """
-    reached = points[lengths(points[:, :3]) < CLOUD_REACH_M]
+    reached = points.compress(lengths(points[:, :3]) < CLOUD_REACH_M, axis=0)
     return transform_points(T_map_points, reached[:, :3].astype(np.float64)), reached[:, 3]
 
 
@@ -44,7 +44,11 @@ def prepared(cloud: VoxelMap) -> SurfelMap | None:
         cloud: the voxel map.
     """
     surfels, brightness = cloud.surfels()
-    found = SurfelMap.prepare(cloud.origin, surfels, brightness) if len(surfels) else None
+    if not len(surfels):
+        return None
+    packed = SurfelMap.packed(surfels, brightness)
+    del surfels, brightness  # a large map has no room for them beside the grid
+    found = SurfelMap.of_packed(cloud.origin, *packed)
     trim()  # the grid is made of many small blocks at first
     return found
 

@@ -28,7 +28,7 @@ from model_training.datasets.dataset import Dataset
 from model_training.mapping.settings import BuildSettings
 from model_training.mapping.survey import clear_scan, travelled_m
 from model_training.mapping.tiles import TilePart
-from model_training.mapping.voxel_map import MOMENTS, SPAN, VoxelMap, ranked
+from model_training.mapping.voxel_map import MOMENTS, SPAN, VoxelMap, parts, ranked
 from model_training.mapping.work import Arrays
 from service.compiled import load
 from service.geometry.lengths import lengths
@@ -49,6 +49,8 @@ LIBRARY = Path(__file__).with_name("_sight.so")
 _ROWS, _COLUMNS = 180, 720
 #: Points nearer than this lie on the vehicle, metres.
 _NEAREST_M = 2.0
+#: Further distance of a tile whose voxels may be within reach, metres. It is much more than the rounding of a position.
+_SLACK_M = 0.1
 #: Number of tiles along an axis that have a number of their own.
 _TILE_SPAN = 1 << 24
 
@@ -143,6 +145,19 @@ def tile_of(positions: NDArray[np.float64]) -> NDArray[np.int64]:
     return _numbered(np.floor(positions[:, :2] / TILE_M).astype(np.int64))
 
 
+def tiles_within(numbers: NDArray[np.int64], position: NDArray[np.float64], reach_m: float) -> NDArray[np.bool_]:
+    """Return whether some point of each tile is within reach of a position (n,).
+
+    Args:
+        numbers: numbers of the tiles, as from ``tile_of`` (n,).
+        position: metres, map frame (2,).
+        reach_m: largest distance, metres.
+    """
+    corner = (np.stack(np.divmod(numbers, _TILE_SPAN), axis=1) - _TILE_SPAN // 2) * TILE_M
+    away = np.maximum(np.maximum(corner - position, position - corner - TILE_M), 0.0)
+    return np.asarray((away**2).sum(axis=1) <= reach_m**2)
+
+
 def _numbered(tiles: NDArray[np.int64]) -> NDArray[np.int64]:
     return np.asarray((tiles[..., 0] + _TILE_SPAN // 2) * _TILE_SPAN + tiles[..., 1] + _TILE_SPAN // 2)
 
@@ -205,14 +220,17 @@ class Targets:
         ranges = [self.by_tile[self.first[k] : self.first[k + 1]] for k in found]
         return np.concatenate(ranges) if ranges else np.zeros(0, np.int32)
 
-    def with_keys(self, keys: NDArray[np.int64]) -> NDArray[np.int64]:
-        """Return the rows of the voxels that have some keys (m,). Keys of other voxels are ignored.
+    def at_points(self, points_map: NDArray[np.float64]) -> NDArray[np.int32]:
+        """Return the rows of the voxels that hold some of the points, ascending (m,). Points in other voxels are ignored.
 
         Args:
-            keys: keys (k,).
+            points_map: metres, map frame (n, 3).
+
+        Raises:
+            DatasetError: a point lies beyond the reach of the voxel map.
         """
-        rows = _positions_in(self.cloud.sums()[0], keys)
-        return np.asarray(rows[self.has_surface[rows]])
+        rows = self.cloud.rows_of(points_map)
+        return rows[self.has_surface[rows]]
 
     def numbers_of(self, rows: NDArray[np.integer[Any]]) -> NDArray[np.int64]:
         """Return the number of the tile of some voxels (m,).
@@ -302,13 +320,16 @@ class Vote:
         for scan in scans:
             T = self.T_map_lidar[scan]
             points = clear_scan(self.dataset, int(self.numbers[scan]), self.settings)[:, :3].astype(np.float64)
-            near = points[lengths(points) <= REACH_M]
-            at = targets.with_keys(np.unique(self.cloud.keys_of(transform_points(T, near))))
+            near = points.compress(lengths(points) <= REACH_M, axis=0)
+            at = targets.at_points(transform_points(T, near))
             hit[at] |= passes.bits(scan, targets.numbers_of(at))
-            seen = looked_through(targets, targets.of_tiles(passes.tiles[scan]), points, T, behind_m=behind_m)
+            tiles = passes.tiles[scan][tiles_within(passes.tiles[scan], T[:2, 3], REACH_M + _SLACK_M)]
+            seen = looked_through(targets, targets.of_tiles(tiles), points, T, behind_m=behind_m)
             through[seen] |= passes.bits(scan, targets.numbers_of(seen))
             report(scan + 1)
-        of = np.flatnonzero(hit | through)
+        # By parts: a large map has no room for another array of all voxels.
+        found = [part.start + np.flatnonzero(hit[part] | through[part]) for part in parts(len(hit))]
+        of = np.concatenate([np.zeros(0, np.int64), *found])
         return {"of": of, "hit": hit[of], "through": through[of]}
 
     def removed(self, votes: Iterable[Arrays], earlier: NDArray[np.int64] | None = None) -> NDArray[np.int64]:

@@ -12,12 +12,12 @@ from model_training.datasets.dataset import Dataset
 from model_training.mapping.between import PlacedScan, PlannedPlaces, Viewpoint, at_scan, viewpoint_at
 from model_training.mapping.cloud import near
 from model_training.mapping.settings import BuildSettings
-from model_training.mapping.survey import clear_scan, fan, fan_views, levelled
+from model_training.mapping.survey import clear_scan, fan, levelled
 from model_training.mapping.tiles import TilePart
 from model_training.mapping.voxel_map import VoxelMap
 from model_training.mapping.work import Arrays
 from service.geometry.rigid import heading_of_body
-from service.imaging.view_grid import ViewGrid, survey_planes
+from service.imaging.view_grid import ViewGrid, fan_planes, panorama_from_points
 from service.maps.streets import Streets
 from service.retrieval.encoder import Encoder
 
@@ -157,7 +157,9 @@ class SurveyTraversal:
         if self.part is None:
             return positions, intensity
         inside = self.part.is_in_cloud(positions)
-        return positions[inside], intensity[inside]
+        if inside.all():
+            return positions, intensity
+        return positions.compress(inside, axis=0), intensity[inside]
 
     def _none(self) -> Arrays:
         """Return the fields of no place, as ``np.stack`` of those of ``_encoded``."""
@@ -173,11 +175,12 @@ class SurveyTraversal:
     def _encoded(self, viewpoint: Viewpoint, sources: tuple[int, int]) -> Arrays:
         """Return the fields of one place in ``Places``; its descriptors are (headings, D)."""
         turns = fan(self.settings.headings)
-        planes = np.stack(
-            [
-                survey_planes(view, sensor_height_m=viewpoint.height_m, rows_seen=self.rows_seen, grid=self.grid)
-                for view in fan_views(viewpoint.points, viewpoint.start_rad + turns, self.grid)
-            ]
+        planes = fan_planes(
+            panorama_from_points(viewpoint.points, self.grid),
+            viewpoint.start_rad + turns,
+            sensor_height_m=viewpoint.height_m,
+            rows_seen=self.rows_seen,
+            grid=self.grid,
         )
         heading_rad = heading_of_body(viewpoint.T_map_level) + viewpoint.start_rad + turns
         return {

@@ -166,7 +166,8 @@ def levelled(points: NDArray[np.float32], number: int, settings: BuildSettings) 
         settings: settings of the map: the expected LiDAR height.
     """
     level = level_scan(points[:, :3], expected_height_m=settings.expected_lidar_height_m)
-    turned = np.c_[points[:, :3] @ level.R_level_sensor.T.astype(np.float32), points[:, 3]]
+    turned = np.empty((len(points), 4), np.float32)
+    turned[:, :3], turned[:, 3] = points[:, :3] @ level.R_level_sensor.T.astype(np.float32), points[:, 3]
     return LevelledScan(number, turned, level, principal_heading(turned[:, :3], height_m=level.height_m))
 
 

@@ -55,25 +55,24 @@ VOXEL = np.dtype(
 
 @cache
 def _library() -> ctypes.CDLL:
-    arguments: list[Any] = [c_void_p, c_void_p, c_int64, c_double, c_void_p, c_double, c_void_p, c_void_p, c_void_p]
-    of_sums: list[Any] = [
-        c_void_p,
-        c_void_p,
-        c_int64,
-        c_void_p,
-        c_double,
-        c_int64,
-        c_void_p,
-        c_void_p,
-        c_void_p,
-        c_void_p,
-    ]
-    constants = {"MOMENTS": MOMENTS, "SPAN": SPAN, "ARGUMENTS": len(arguments), "SUM_ARGUMENTS": len(of_sums)}
-    library = load(LIBRARY, constants=constants)
-    library.streetfix_sums.argtypes = of_sums
-    library.streetfix_sums.restype = c_int64
-    library.streetfix_surfels.argtypes = arguments
-    library.streetfix_surfels.restype = None
+    arguments: dict[str, list[Any]] = {
+        "surfels": [c_void_p, c_void_p, c_int64, c_double, c_void_p, c_double, c_void_p, c_void_p, c_void_p],
+        "sums": [
+            c_void_p, c_void_p, c_int64, c_void_p, c_double, c_int64,
+            c_void_p, c_void_p, c_int64, c_void_p, c_void_p, c_void_p, c_void_p, c_void_p,
+        ],
+        "rows": [
+            c_void_p, c_int64, c_void_p, c_double, c_int64,
+            c_void_p, c_void_p, c_int64, c_void_p, c_void_p, c_int64, c_void_p,
+        ],
+        "summed": [c_void_p, c_void_p, c_void_p, c_int64, c_void_p, c_void_p],
+        "absorb": [c_void_p, c_void_p, c_int64, c_void_p, c_void_p, c_int64, c_void_p],
+    }  # fmt: skip
+    counts = {f"{name.upper()}_ARGUMENTS": len(given) for name, given in arguments.items()}
+    library = load(LIBRARY, constants={"MOMENTS": MOMENTS, "SPAN": SPAN, **counts})
+    for name, given in arguments.items():
+        function = getattr(library, f"streetfix_{name}")
+        function.argtypes, function.restype = given, None if name == "surfels" else c_int64
     return library
 
 
@@ -145,30 +144,108 @@ class VoxelMap:
         Raises:
             DatasetError: a point lies beyond the reach of the map.
         """
+        self._add(*self._sums_of(points_map, intensity))
+
+    def add_from(
+        self, points_map: NDArray[np.float64], source: NDArray[np.integer[Any]]
+    ) -> tuple[NDArray[np.int64], NDArray[np.bool_], NDArray[np.int32]]:
+        """Add points of several sources.
+
+        Args:
+            points_map: metres, map frame (n, 3).
+            source: number of the source of each point, ascending (n,).
+
+        Returns:
+            The keys of the voxels of these points, ascending (k,); whether each has points of more than one source (k,); and the row of
+            the voxel of each point among them (n,).
+
+        Raises:
+            DatasetError: a point lies beyond the reach of the map.
+        """
+        row_of = np.empty(len(points_map), np.int32)
+        keys, moments = self._sums_of(points_map, None, row_of)
+        self._add(keys, moments)
+        first, last = np.empty((2, len(keys)), source.dtype)
+        first[row_of[::-1]], last[row_of] = source[::-1], source  # the last of several values stays
+        return keys, first != last, row_of
+
+    def rows_of(self, points_map: NDArray[np.float64]) -> NDArray[np.int32]:
+        """Return the rows in ``sums`` of the voxels that hold some of the points, ascending (k,).
+
+        Args:
+            points_map: metres, map frame (n, 3).
+
+        Raises:
+            DatasetError: a point lies beyond the reach of the map.
+        """
+        points, keys = np.ascontiguousarray(points_map, np.float64), self.sums()[0]
+        rows = np.empty(len(points), np.int32)
+        found = self._gathered("rows", points, (), (keys.ctypes.data, len(keys), rows.ctypes.data))
+        return rows[:found].copy()
+
+    def _sums_of(
+        self,
+        points_map: NDArray[np.float64],
+        intensity: NDArray[np.floating[Any]] | None,
+        row_of: NDArray[np.int32] | None = None,
+    ) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
+        """Return the keys of the voxels of points, ascending (k,), and their moments (k, 12).
+
+        Write the row of the voxel of each point to ``row_of`` (n,).
+        """
         points = np.ascontiguousarray(points_map, np.float64)
-        count = len(points)
         bright = None if intensity is None else np.ascontiguousarray(intensity, np.float32)
-        key_of, numbers = np.empty(count, np.int64), np.empty((2, count), np.int32)
-        keys, moments = np.empty(count, np.int64), np.empty((count, MOMENTS), np.float32)
-        origin = np.ascontiguousarray(self.origin, np.float64)
-        found = _library().streetfix_sums(
+        shape = (len(points), MOMENTS)
+        sums, keys, moments = np.empty(shape), np.empty(len(points), np.int64), np.empty(shape, np.float32)
+        found = self._gathered(
+            "sums",
+            points,
+            (None if bright is None else bright.ctypes.data,),
+            (
+                sums.ctypes.data,
+                keys.ctypes.data,
+                moments.ctypes.data,
+                None if row_of is None else row_of.ctypes.data,
+            ),
+        )
+        return keys[:found].copy(), moments[:found].copy()
+
+    def _gathered(
+        self, name: str, points: NDArray[np.float64], more: tuple[int | None, ...], last: tuple[int | None, ...]
+    ) -> int:
+        """Call a function of the library that gathers points by voxel; return the number of voxels that it found.
+
+        Args:
+            name: ``sums`` or ``rows``.
+            points: metres, map frame (n, 3).
+            more: its arguments after the points.
+            last: its last arguments.
+
+        Raises:
+            DatasetError: a point lies beyond the reach of the map.
+        """
+        count, slot_bits = len(points), max(1, len(points).bit_length())
+        keys, slots = np.empty(count, np.int64), np.empty(1 << slot_bits, np.int32)
+        numbers, origin = np.empty((2, count), np.int32), np.ascontiguousarray(self.origin, np.float64)
+        found: int = getattr(_library(), f"streetfix_{name}")(
             points.ctypes.data,
-            None if bright is None else bright.ctypes.data,
+            *more,
             count,
             origin.ctypes.data,
             self.voxel_m,
             _FARTHEST,
-            key_of.ctypes.data,
-            numbers.ctypes.data,
             keys.ctypes.data,
-            moments.ctypes.data,
+            slots.ctypes.data,
+            slot_bits,
+            numbers.ctypes.data,
+            *last,
         )
         if found < 0:
             self._cells(points)  # raises, and names the point, unless rounding puts it on the limit itself
             raise DatasetError(
                 f"a point lies at the limit of the map, {self.reach_m / 1000:.0f} km from its middle", field="poses"
             )
-        self._add(keys[:found].copy(), moments[:found].copy())
+        return found
 
     def add_sums(self, keys: NDArray[np.int64], moments: NDArray[np.floating[Any]]) -> None:
         """Add the ``sums`` of another map with the same voxel edge and the same origin.
@@ -213,7 +290,7 @@ class VoxelMap:
             wanted: True for the voxels to keep, in the order of ``sums`` (n,).
         """
         self._merge()
-        self._keys, self._moments = self._keys[wanted], self._moments[wanted]
+        self._keys, self._moments = self._keys[wanted], self._moments.compress(wanted, axis=0)
 
     def means(self) -> NDArray[np.float64]:
         """Return the mean of each voxel's points (n, 3), metres, map frame, in the order of ``sums``."""
@@ -315,13 +392,29 @@ class VoxelMap:
             return
         keys, moments = (np.concatenate(each) for each in zip(*self._waiting, strict=True))
         self._waiting = []
-        added, moments = _summed(keys, moments)
-        at = np.searchsorted(self._keys, added)
-        known = at < len(self._keys)
-        known[known] = self._keys[at[known]] == added[known]
-        self._moments[at[known]] += moments[known]
-        if not known.all():
-            self._insert(at[~known], added[~known], moments[~known])
+        order = np.argsort(keys, kind="stable")
+        added, sums = np.empty_like(keys), np.empty_like(moments)
+        count = _library().streetfix_summed(
+            keys.ctypes.data,
+            moments.ctypes.data,
+            order.ctypes.data,
+            len(keys),
+            added.ctypes.data,
+            sums.ctypes.data,
+        )
+        del keys, moments, order  # a large map has no room for them while it grows
+        before = np.empty(count, np.int64)
+        unknown = _library().streetfix_absorb(
+            self._keys.ctypes.data,
+            self._moments.ctypes.data,
+            len(self._keys),
+            added.ctypes.data,
+            sums.ctypes.data,
+            count,
+            before.ctypes.data,
+        )
+        if unknown:
+            self._insert(before[:unknown], added[:unknown], sums[:unknown])
 
     def _insert(self, at: NDArray[np.int64], new_keys: NDArray[np.int64], new_moments: NDArray[np.float32]) -> None:
         """Insert voxels before some rows, as ``np.insert`` does. A large map has no room for a copy of itself, so it grows in place."""

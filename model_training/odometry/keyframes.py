@@ -12,7 +12,7 @@ from model_training.mapping.survey import fan
 from model_training.odometry.scan_to_map import PosedScan
 from service.geometry.rigid import Transform
 from service.imaging.pca import USUAL_LIDAR_HEIGHT_M, Level, level_scan, principal_heading
-from service.imaging.view_grid import ViewGrid, panorama_from_points, survey_planes, view_from_panorama
+from service.imaging.view_grid import ViewGrid, fan_planes, panorama_from_points
 from service.retrieval.encoder import Encoder
 
 #: Least distance travelled between keyframes, metres.
@@ -112,16 +112,8 @@ def _keyframe(scan: PosedScan, index: int, travelled_m: float, encoder: Encoder,
     grid = ViewGrid(rows=encoder.rows, columns=encoder.columns)
     panorama = panorama_from_points(levelled, grid)
     every_row = np.ones(grid.rows, np.bool_)  # one LiDAR recorded both sides of a comparison
-    planes = np.stack(
-        [
-            survey_planes(
-                view_from_panorama(panorama, start_rad + turn, grid),
-                sensor_height_m=level.height_m,
-                rows_seen=every_row,
-                grid=grid,
-            )
-            for turn in fan(HEADINGS)
-        ]
+    planes = fan_planes(
+        panorama, start_rad + fan(HEADINGS), sensor_height_m=level.height_m, rows_seen=every_row, grid=grid
     )
     descriptors = encoder.encode(planes, "survey")
     return Keyframe(index, scan.stamp_s, scan.T_first_lidar, travelled_m, level, start_rad, descriptors)

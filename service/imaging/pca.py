@@ -109,7 +109,7 @@ def level_scan(points: Cloud, *, expected_height_m: float = USUAL_LIDAR_HEIGHT_M
     Returns:
         Level of the scan. With fewer than 12 ground cells it is the sensor's own level at the expected height.
     """
-    candidates = _lowest_of_cells(np.asarray(points, np.float64), expected_height_m, height_slack_m)
+    candidates = _lowest_of_cells(points, expected_height_m, height_slack_m)
     if len(candidates) < 12:
         return Level(np.eye(3), expected_height_m)
     normal, offset = np.array([0.0, 0.0, 1.0]), float(np.quantile(candidates[:, 2], 0.3))
@@ -129,20 +129,19 @@ def level_scan(points: Cloud, *, expected_height_m: float = USUAL_LIDAR_HEIGHT_M
     return Level(rotation_taking(normal, np.array([0.0, 0.0, 1.0])), -offset)
 
 
-def _lowest_of_cells(points: NDArray[np.float64], height_m: float, slack_m: float) -> NDArray[np.float64]:
-    radius = np.hypot(points[:, 0], points[:, 1])
+def _lowest_of_cells(points: Cloud, height_m: float, slack_m: float) -> NDArray[np.float64]:
+    x, y, z = (np.ascontiguousarray(axis, np.float64) for axis in points.T)
+    radius = np.hypot(x, y)
     low = (radius > GROUND_NEAR_M) & (radius < GROUND_REACH_M)
-    low &= np.abs(points[:, 2] + height_m) < slack_m + 0.12 * radius
-    near = points[low]
-    if len(near) == 0:
-        return near
+    low &= np.abs(z + height_m) < slack_m + 0.12 * radius
+    near = np.stack([axis[low] for axis in (x, y, z)], axis=1)
     side = int(2 * GROUND_REACH_M / GROUND_CELL_M) + 2
     cell = ((near[:, :2] + GROUND_REACH_M) / GROUND_CELL_M).astype(np.int64)
     key = cell[:, 0] * side + cell[:, 1]
-    order = np.lexsort((near[:, 2], key))
-    first = np.unique(key[order], return_index=True)[1]
-    chosen: NDArray[np.float64] = near[order[first]]
-    return chosen
+    lowest = np.full(side * side, np.inf)
+    np.minimum.at(lowest, key, near[:, 2])
+    found = np.flatnonzero(near[:, 2] == lowest[key])  # of equally low points of a cell the first counts
+    return near[found[np.unique(key[found], return_index=True)[1]]]
 
 
 def principal_heading(
@@ -170,10 +169,12 @@ def principal_heading(
     x, y = points_level[:, 0], points_level[:, 1]
     height = points_level[:, 2] + height_m
     keep = (height > low_m) & (height < high_m) & (np.hypot(x, y) < reach_m)
-    column = ((np.asarray(points_level[keep, :2], np.float64) + reach_m) / HEADING_CELL_M).astype(np.int64)
+    column_x, column_y = (
+        ((axis[keep].astype(np.float64) + reach_m) / HEADING_CELL_M).astype(np.int64) for axis in (x, y)
+    )
     occupied = np.zeros((int(2 * reach_m / HEADING_CELL_M) + 2,) * 2)
-    occupied[column[:, 0], column[:, 1]] = 1.0
-    count, cxx, cxy, cyy = _moments_around(occupied, HEADING_WINDOW)[:, occupied > 0]
+    occupied[column_x, column_y] = 1.0
+    count, cxx, cxy, cyy = _moments_around(occupied, HEADING_WINDOW)
     enough = count >= HEADING_FEWEST
     # The magnitude of ``axis2`` is the difference of the eigenvalues. Its angle is twice the angle of the major axis, because an
     # axis has no sign.
@@ -191,16 +192,22 @@ def principal_heading(
 
 
 def _moments_around(occupied: NDArray[np.float64], window: int) -> NDArray[np.float64]:
-    """Compute count and covariance xx, xy, yy (cells squared) of the occupied cells in a window around each cell.
+    """Compute count and covariance xx, xy, yy (cells squared) of the occupied cells in a window around each occupied cell.
 
-    The result has the shape (4, n, n).
+    The result has the shape (4, k), for k occupied cells in the order of ``np.nonzero``.
     """
-    at = np.arange(len(occupied)) - len(occupied) / 2
-    x, y = np.meshgrid(at, at, indexing="ij")
-    sums = occupied * np.stack([np.ones_like(x), x, y, x * x, x * y, y * y])
-    corner = np.pad(sums, ((0, 0), (window + 1, window), (window + 1, window))).cumsum(axis=1).cumsum(axis=2)
-    side = 2 * window + 1
-    inside = corner[:, side:, side:] - corner[:, :-side, side:] - corner[:, side:, :-side] + corner[:, :-side, :-side]
-    count = inside[0]
-    mx, my, xx, xy, yy = inside[1:] / np.maximum(count, 1.0)
+    row, column = np.nonzero(occupied)
+    padded, stride = np.pad(occupied, window), len(occupied) + 2 * window
+    away = np.arange(-window, window + 1)
+    dx, dy = (each.ravel() for each in np.meshgrid(away, away, indexing="ij"))
+    neighbours = padded.ravel().take(((dx + window) * stride + dy + window)[:, None] + row * stride + column)
+    count, sx, sy, sxx, sxy, syy = np.stack([dx**0, dx, dy, dx * dx, dx * dy, dy * dy]).astype(np.float64) @ neighbours
+    # Sums about the middle of the grid. All terms are multiples of a quarter, so they are exact in any order.
+    x, y = row - len(occupied) / 2, column - len(occupied) / 2
+    sxx, sxy, syy = (
+        sxx + (2 * sx + x * count) * x,
+        sxy + x * sy + y * sx + x * y * count,
+        syy + (2 * sy + y * count) * y,
+    )
+    mx, my, xx, xy, yy = np.stack([sx + x * count, sy + y * count, sxx, sxy, syy]) / np.maximum(count, 1.0)
     return np.stack([count, xx - mx * mx, xy - mx * my, yy - my * my])

@@ -113,7 +113,7 @@ def panorama_from_points(points_level: Float32[NDArray[np.float32], "N 4"], grid
     Returns:
         Range (metres) and intensity. Both are 0 where nothing was measured within the limits.
     """
-    x, y, z, intensity = points_level.T
+    x, y, z, intensity = (np.ascontiguousarray(axis) for axis in points_level.T)
     flat = np.hypot(x, y)
     distance = np.hypot(flat, z)
     elevation = np.arctan2(z, flat)
@@ -125,35 +125,63 @@ def panorama_from_points(points_level: Float32[NDArray[np.float32], "N 4"], grid
     column = np.rint(column_exact).astype(np.int64) % around
     good = (row >= 0) & (row < grid.rows) & (distance >= grid.min_range_m) & (distance <= grid.max_range_m)
     cell = (row * around + column)[good]
-    # Written in the order of falling distance to the ray of the cell, so that the nearest point is written last and stays.
     off = np.abs(row_exact - row)[good] + np.abs(column_exact - np.rint(column_exact))[good]
-    order = np.argsort(-off, kind="stable")
+    least = np.full(grid.rows * around, np.inf, off.dtype)
+    np.minimum.at(least, cell, off)
+    nearest = np.flatnonzero(off == least[cell])  # of equally near points of a cell the last is written last and stays
     panorama = np.zeros((2, grid.rows * around), np.float32)
-    panorama[0, cell[order]] = distance[good][order]
-    panorama[1, cell[order]] = intensity[good][order]
-    return _fill_between_beams(panorama.reshape(2, grid.rows, around))
+    panorama[0, cell[nearest]] = distance[good][nearest]
+    panorama[1, cell[nearest]] = intensity[good][nearest]
+    _fill_between_beams(panorama, around)
+    return panorama.reshape(2, grid.rows, around)
 
 
-def _fill_between_beams(panorama: Panorama) -> Panorama:
-    """Fill gaps of one to three rows, and of one column, whose two sides lie on one surface.
+def _fill_between_beams(cells: Float32[NDArray[np.float32], "2 cells"], around: int) -> None:
+    """Fill gaps of one to three rows, and of one column, whose two sides lie on one surface, in place.
 
     The ranges of the two sides may differ by 15, 20 or 25 % across one, two or three rows, and by 10 % across a column.
+
+    Args:
+        cells: range and intensity of the cells of a panorama, row by row.
+        around: number of cells of a row.
     """
-    filled = panorama.copy()
-    rows = panorama.shape[1]
+    holes = np.flatnonzero(cells[0] == 0)
     for gap in (1, 2, 3):
         for offset in range(1, gap + 1):
-            above, below = filled[:, : rows - gap - 1], filled[:, gap + 1 :]
-            hole = filled[:, offset : rows - gap - 1 + offset]
-            agree = (hole[0] == 0) & (above[0] > 0) & (below[0] > 0)
-            agree &= np.abs(above[0] - below[0]) < (0.10 + 0.05 * gap) * np.minimum(above[0], below[0])
+            below = gap + 1 - offset  # rows from the hole to its lower side
+            begin, end = np.searchsorted(holes, [offset * around, cells.shape[1] - below * around])
+            within = holes[begin:end]
+            at, above, under = _on_one_surface(
+                cells[0], within, within - offset * around, within + below * around, 0.10 + 0.05 * gap
+            )
             share = np.float32(offset / (gap + 1))
-            hole[:, agree] = (1 - share) * above[:, agree] + share * below[:, agree]
-    left, right = np.roll(filled, 1, axis=2), np.roll(filled, -1, axis=2)
-    agree = (filled[0] == 0) & (left[0] > 0) & (right[0] > 0)
-    agree &= np.abs(left[0] - right[0]) < 0.10 * np.minimum(left[0], right[0])
-    filled[:, agree] = 0.5 * (left[:, agree] + right[:, agree])
-    return filled
+            cells[:, at] = (1 - share) * cells[:, above] + share * cells[:, under]
+            holes = holes[cells[0, holes] == 0]
+    row, column = np.divmod(holes, around)
+    left, right = (row * around + (column + step) % around for step in (-1, 1))
+    at, left, right = _on_one_surface(cells[0], holes, left, right, 0.10)
+    cells[:, at] = 0.5 * (cells[:, left] + cells[:, right])
+
+
+def _on_one_surface(
+    ranges: Float32[NDArray[np.float32], " cells"],
+    holes: NDArray[np.int64],
+    first: NDArray[np.int64],
+    second: NDArray[np.int64],
+    may_differ: float,
+) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
+    """Return the holes whose two sides lie on one surface, and these sides, as indices of cells, (m,) each.
+
+    Args:
+        ranges: range of each cell, metres, 0 in a hole.
+        holes: indices of the holes (n,).
+        first: indices of their first sides (n,).
+        second: indices of their second sides (n,).
+        may_differ: how much the ranges of the sides may differ, as a share of the smaller one.
+    """
+    one, other = ranges[first], ranges[second]
+    agree = (one > 0) & (other > 0) & (np.abs(one - other) < may_differ * np.minimum(one, other))
+    return holes[agree], first[agree], second[agree]
 
 
 def view_from_panorama(panorama: Panorama, heading_rad: float, grid: ViewGrid) -> LidarView:
@@ -164,9 +192,13 @@ def view_from_panorama(panorama: Panorama, heading_rad: float, grid: ViewGrid) -
         heading_rad: heading of the view from x of the panorama's level frame, counter-clockwise, radians.
         grid: view grid, the one of the panorama.
     """
+    return panorama.take(_columns_at(heading_rad, grid), axis=2)
+
+
+def _columns_at(heading_rad: float, grid: ViewGrid) -> NDArray[np.int64]:
+    """Return the columns of a panorama that are the columns of the view along a heading (columns,)."""
     azimuth = heading_rad + grid.azimuths_rad
-    column = np.rint((azimuth + np.pi) / (2 * np.pi) * grid.around).astype(np.int64) % grid.around
-    return panorama[:, :, column]
+    return np.rint((azimuth + np.pi) / (2 * np.pi) * grid.around).astype(np.int64) % grid.around
 
 
 def survey_planes(
@@ -186,13 +218,51 @@ def survey_planes(
         rows_seen: rows that the LiDAR of the survey covers. The other rows are blank in map views and query views (decision 0006).
         grid: view grid.
     """
-    planes = np.zeros((len(PLANES), grid.rows, grid.columns), np.float32)
-    ranges, intensity = view
+    planes: Planes = _planes_of(view, [np.arange(grid.columns)], sensor_height_m, rows_seen, grid)[0]
+    return planes
+
+
+def fan_planes(
+    panorama: Panorama,
+    headings_rad: Float64[NDArray[np.float64], " views"],
+    *,
+    sensor_height_m: float,
+    rows_seen: Bool[NDArray[np.bool_], " rows"],
+    grid: ViewGrid,
+) -> Float32[NDArray[np.float32], "views 6 rows columns"]:
+    """Compute the input planes of the encoder for the views of a panorama along several headings.
+
+    They are those of ``survey_planes`` for each ``view_from_panorama``. But what does not depend on the heading is computed once.
+
+    Args:
+        panorama: range (metres) and intensity over 360 degrees.
+        headings_rad: heading of each view from x of the panorama's level frame, counter-clockwise, radians.
+        sensor_height_m: height of the LiDAR above the local ground, metres.
+        rows_seen: rows that the LiDAR of the survey covers.
+        grid: view grid, the one of the panorama.
+    """
+    columns = [_columns_at(float(heading_rad), grid) for heading_rad in headings_rad]
+    return _planes_of(panorama, columns, sensor_height_m, rows_seen, grid)
+
+
+def _planes_of(
+    measured: Float32[NDArray[np.float32], "2 rows _"],
+    columns: list[NDArray[np.int64]],
+    sensor_height_m: float,
+    rows_seen: Bool[NDArray[np.bool_], " rows"],
+    grid: ViewGrid,
+) -> Float32[NDArray[np.float32], "views 6 rows columns"]:
+    """Compute the planes of views that have some columns of a measurement (range and intensity)."""
+    ranges, intensity = measured
     inside = (ranges >= grid.min_range_m) & (ranges <= grid.max_range_m) & rows_seen[:, None]
-    planes[0] = ranges * inside
-    planes[3] = heights_of(planes[0], sensor_height_m, grid)
-    planes[4] = rows_seen[:, None]
-    planes[5] = brightness(intensity, measured=inside, seen=inside)
+    kept = ranges * inside
+    height = heights_of(kept, sensor_height_m, grid)
+    planes = np.zeros((len(columns), len(PLANES), grid.rows, grid.columns), np.float32)
+    planes[:, 4] = rows_seen[:, None]
+    for view, some in zip(planes, columns, strict=True):
+        seen = inside.take(some, axis=1)
+        view[0], view[3] = kept.take(some, axis=1), height.take(some, axis=1)
+        view[5] = brightness(intensity.take(some, axis=1), measured=seen, seen=seen)
     return planes
 
 
@@ -235,10 +305,16 @@ def brightness(
     mean = float(of_measured.mean()) if of_measured.size else 0.0
     if not mean > 0:
         return np.zeros_like(values)
-    logarithm = np.log(values / np.float32(mean) + np.float32(BRIGHTNESS_FLOOR))
-    middle, spread = float(logarithm[measured].mean()), float(logarithm[measured].std())
+
+    def logarithm(of: NDArray[np.float32]) -> NDArray[np.float32]:
+        return np.asarray(np.log(of / np.float32(mean) + np.float32(BRIGHTNESS_FLOOR)))
+
+    of_measured = logarithm(of_measured)
+    middle, spread = float(of_measured.mean()), float(of_measured.std())
     if spread < LEAST_BRIGHTNESS_SPREAD:
         return np.zeros_like(values)
-    scaled = np.clip((logarithm - np.float32(middle)) / np.float32(spread), -BRIGHTNESS_LIMIT, BRIGHTNESS_LIMIT)
-    result: Float32[NDArray[np.float32], "rows columns"] = np.where(seen, scaled, np.float32(0))
+    of_seen = of_measured if seen is measured else logarithm(values[seen])
+    scaled = (of_seen - np.float32(middle)) / np.float32(spread)
+    result = np.zeros_like(values)
+    result[seen] = np.minimum(np.maximum(scaled, -BRIGHTNESS_LIMIT), BRIGHTNESS_LIMIT)
     return result

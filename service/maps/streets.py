@@ -1,6 +1,6 @@
 """Street polygons of a map. A polygon has a street, a section and a class of the paper's Table I."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, Literal
 
 import numpy as np
@@ -10,6 +10,8 @@ from numpy.typing import NDArray
 from service.errors import BundleError
 
 FILE = "streets.geojson"
+#: Margin of the box of a street, metres. It is much more than the rounding of a crossing.
+_SLACK_M = 1.0
 #: A ring of a polygon. ``_`` because the rings of one street differ in length.
 Ring = Float64[NDArray[np.float64], "_ 2"]
 
@@ -33,6 +35,13 @@ class Street:
     name: str
     class_index: int
     polygons: tuple[tuple[Ring, ...], ...]
+    _box: tuple[float, float, float, float] = field(init=False, repr=False, compare=False)
+
+    def __post_init__(self) -> None:
+        """Find the box of the polygons. Most points lie outside of it, and need no further check."""
+        points = np.concatenate([np.zeros((0, 2)), *(ring for rings in self.polygons for ring in rings)])
+        low, high = points.min(axis=0, initial=np.inf) - _SLACK_M, points.max(axis=0, initial=-np.inf) + _SLACK_M
+        object.__setattr__(self, "_box", (*low.tolist(), *high.tolist()))
 
     def contains(self, position: Float64[NDArray[np.float64], "2"]) -> bool:
         """Check whether a point lies inside a polygon. Holes are outside.
@@ -40,6 +49,9 @@ class Street:
         Args:
             position: x, y in the coordinates of the polygons (map metres in a bundle).
         """
+        x0, y0, x1, y1 = self._box
+        if not (x0 <= position[0] <= x1 and y0 <= position[1] <= y1):
+            return False
         return any(sum(_inside(ring, position) for ring in rings) % 2 == 1 for rings in self.polygons)
 
 

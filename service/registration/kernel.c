@@ -501,41 +501,65 @@ WIDE void streetfix_lookup(const Grid *g, const double *positions, int64_t count
     }
 }
 
+/* Cells along z that a processor compares with a surfel at once. */
+#define TOGETHER 8
+
+/* Enters a surfel in the cells of a region whose centres are in its reach and not nearer to an earlier surfel. ``low``, ``high``: the first
+ * and the last cell along each axis. ``away2`` (3, REGION_EDGE): squared distance of each of these cells' centres from the surfel, m2.
+ * ``reach2``: squared reach, m2. */
+static inline void enter(int32_t surfel, const int64_t *low, const int64_t *high, double away2[3][REGION_EDGE], double reach2,
+                         int32_t *surfel_of, float *distance2)
+{
+    if (low[2] > high[2]) return;
+    const int64_t cells = (high[2] - low[2] + TOGETHER) / TOGETHER * TOGETHER; /* whole groups, which stay in the region */
+    const int64_t first = low[2] < REGION_EDGE - cells ? low[2] : REGION_EDGE - cells;
+    double of_z[REGION_EDGE];
+    for (int64_t k = 0; k < cells; k++) of_z[k] = first + k >= low[2] && first + k <= high[2] ? away2[2][first + k] : INFINITY;
+    for (int64_t x = low[0]; x <= high[0]; x++)
+        for (int64_t y = low[1]; y <= high[1]; y++) {
+            const double of_xy = away2[0][x] + away2[1][y];
+            if (of_xy > reach2 * 1.000001) continue; /* more than rounding beyond the reach */
+            float *d2 = distance2 + (x * REGION_EDGE + y) * REGION_EDGE + first;
+            int32_t *of = surfel_of + (x * REGION_EDGE + y) * REGION_EDGE + first;
+            for (int64_t k = 0; k < cells; k++) {
+                const float own = (float)(of_xy + of_z[k]), other = d2[k];
+                d2[k] = own < other ? own : other;
+                of[k] = own < other ? surfel : of[k];
+            }
+        }
+}
+
 /* Builds one region; its key is set. ``xyz`` (n, 3): positions of all surfels, surfels' frame, m. ``which`` (count): rows of the surfels
  * whose reach may touch the region, ascending. Work memory for
  * all cells of the region: ``surfel_of`` and ``distance2``. Writes the row of each block to the region, the filled blocks to ``blocks``, and
  * the surfels of their filled cells to ``nearest``. The field ``first`` of a block counts from the start of ``nearest``. Returns the number
  * of blocks. */
-int64_t streetfix_build_region(const Grid *g, const float *xyz, const int32_t *which, int64_t count, double reach, int32_t *surfel_of,
-                               float *distance2, Region *region, Block *blocks, int32_t *nearest)
+WIDE int64_t streetfix_build_region(const Grid *g, const float *xyz, const int32_t *which, int64_t count, double reach, int32_t *surfel_of,
+                                    float *distance2, Region *region, Block *blocks, int32_t *nearest)
 {
-    const double o[3] = {g->ox, g->oy, g->oz};
+    const double o[3] = {g->ox, g->oy, g->oz}, reach2 = reach * reach;
     const int64_t mask = ((int64_t)1 << KEY_BITS) - 1;
     const int64_t corner[3] = {REGION_EDGE * (region->key >> 2 * KEY_BITS), REGION_EDGE * (region->key >> KEY_BITS & mask),
                                REGION_EDGE * (region->key & mask)};
-    for (int64_t i = 0; i < REGION_EDGE * REGION_EDGE * REGION_EDGE; i++) surfel_of[i] = -1, distance2[i] = INFINITY;
+    /* A distance is in reach if it is less than ``beyond``, the least number above the reach. */
+    float beyond = (float)reach2;
+    if (beyond <= reach2) beyond = nextafterf(beyond, INFINITY);
+    for (int64_t i = 0; i < REGION_EDGE * REGION_EDGE * REGION_EDGE; i++) surfel_of[i] = -1, distance2[i] = beyond;
+    double away2[3][REGION_EDGE];
     for (int64_t i = 0; i < count; i++) {
         const float *p = xyz + 3 * (int64_t)which[i];
         int64_t low[3], high[3];
         for (int k = 0; k < 3; k++) {
-            low[k] = (int64_t)ceil((p[k] - reach - o[k]) / g->cell - 0.5);
-            high[k] = (int64_t)floor((p[k] + reach - o[k]) / g->cell - 0.5);
-            low[k] = low[k] > corner[k] ? low[k] : corner[k];
-            high[k] = high[k] < corner[k] + REGION_EDGE - 1 ? high[k] : corner[k] + REGION_EDGE - 1;
+            low[k] = (int64_t)ceil((p[k] - reach - o[k]) / g->cell - 0.5) - corner[k];
+            high[k] = (int64_t)floor((p[k] + reach - o[k]) / g->cell - 0.5) - corner[k];
+            low[k] = low[k] > 0 ? low[k] : 0;
+            high[k] = high[k] < REGION_EDGE - 1 ? high[k] : REGION_EDGE - 1;
+            for (int64_t cell = low[k]; cell <= high[k]; cell++) {
+                const double away = o[k] + ((double)(corner[k] + cell) + 0.5) * g->cell - p[k];
+                away2[k][cell] = away * away;
+            }
         }
-        for (int64_t x = low[0]; x <= high[0]; x++)
-            for (int64_t y = low[1]; y <= high[1]; y++)
-                for (int64_t z = low[2]; z <= high[2]; z++) {
-                    double dx = o[0] + (x + 0.5) * g->cell - p[0], dy = o[1] + (y + 0.5) * g->cell - p[1];
-                    double dz = o[2] + (z + 0.5) * g->cell - p[2];
-                    float d2 = (float)(dx * dx + dy * dy + dz * dz);
-                    if (d2 > reach * reach) continue;
-                    const int64_t at = ((x - corner[0]) * REGION_EDGE + y - corner[1]) * REGION_EDGE + z - corner[2];
-                    if (d2 < distance2[at]) {
-                        distance2[at] = d2;
-                        surfel_of[at] = which[i];
-                    }
-                }
+        enter(which[i], low, high, away2, reach2, surfel_of, distance2);
     }
     int64_t found = 0, cells = 0;
     for (int64_t number = 0; number < REGION_BLOCKS; number++) {

@@ -30,8 +30,8 @@ BLOCK = 8
 REGION = 8
 #: Bits of a region's number along each axis, in its key.
 KEY_BITS = 18
-#: Surfels that are assigned to regions at once.
-_CHUNK = 1 << 18
+#: Surfels that are assigned to regions at once. Each takes some hundred bytes meanwhile.
+_CHUNK = 1 << 16
 #: Points in a batch of the kernel. Arrays of points are padded to whole batches.
 BATCH_SIZE = 32
 #: Standard deviation of a point's distance to its surface in the score of a pose, m, apart from its noise.
@@ -446,10 +446,30 @@ def _as_c(query: QueryPoints, options: SolverOptions) -> tuple[_Query, _Options]
         (8, query.q),
     ):
         planes[rows, : len(query)] = values
-    at = [planes.ctypes.data + number * planes.strides[0] for number in range(len(planes))]
+    first = planes.ctypes.data
+    at = [first + number * planes.strides[0] for number in range(len(planes))]
     points = _Query(len(query), (c_void_p * 3)(*at[:3]), (c_void_p * 3)(*at[3:6]), *at[6:])
     points.planes = planes  # keeps the memory alive as long as the pointers to it
     return points, given
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PackedSurfels:
+    """The surfels of a map, and what their lookup grid is built from.
+
+    Attributes:
+        surfels: (S,) of ``PACKED_SURFEL``, sorted by region.
+        regions: (R,) of ``GRID_REGION``, ascending by key. Of the regions with surfels they have the key and the surfels.
+        origin_m: corner of the grid in the surfels' frame, m.
+        cell_m: edge of a cell, m.
+        reach_m: largest distance from a surfel to the centre of a cell that refers to it, m.
+    """
+
+    surfels: NDArray[Any]
+    regions: NDArray[Any]
+    origin_m: Float64[NDArray[np.float64], "3"]
+    cell_m: float
+    reach_m: float
 
 
 def packed_map(
@@ -457,7 +477,8 @@ def packed_map(
 ) -> tuple[NearestGrid, NDArray[Any], NDArray[np.int64]]:
     """Pack the surfels of a map and build their lookup grid, once per map build.
 
-    The grid is built region by region. The memory grows with the number of surfels, not with the distances between them.
+    A large map has no room for both forms of the surfels. It packs them, frees them and then builds the grid (``packed_surfels``,
+    ``nearest_grid``).
 
     Args:
         surfels: of the map, (S,) of ``SURFEL``, in any order.
@@ -466,6 +487,24 @@ def packed_map(
 
     Returns:
         The grid, the surfels (S,) of ``PACKED_SURFEL`` sorted by region, and their rows in ``surfels`` (S,).
+
+    Raises:
+        StreetfixError: the surfels lie too far from each other for the numbers of the regions, or a number is not finite.
+    """
+    packed, order = packed_surfels(surfels, cell_m=cell_m, reach_m=reach_m)
+    return nearest_grid(packed), packed.surfels, order
+
+
+def packed_surfels(surfels: NDArray[Any], *, cell_m: float, reach_m: float) -> tuple[PackedSurfels, NDArray[np.int64]]:
+    """Pack the surfels of a map.
+
+    Args:
+        surfels: of the map, (S,) of ``SURFEL``, in any order.
+        cell_m: edge of a cell of their lookup grid, m.
+        reach_m: largest distance from a surfel to the centre of a cell that refers to it, m.
+
+    Returns:
+        The packed surfels, and their rows in ``surfels`` (S,).
 
     Raises:
         StreetfixError: the surfels lie too far from each other for the numbers of the regions, or a number is not finite.
@@ -485,16 +524,29 @@ def packed_map(
     frame, keys = _Grid(*origin, cell_m), np.empty(len(surfels), np.int64)
     _library().streetfix_keys(byref(frame), surfels.ctypes.data, len(surfels), keys.ctypes.data)
     order = np.argsort(keys, kind="stable")
+    keys = keys[order]
+    first = np.flatnonzero(np.r_[True, keys[1:] != keys[:-1]])
+    own = np.zeros(len(first), GRID_REGION)
+    own["key"], own["surfel"], own["surfels"] = keys[first], first, np.diff(np.r_[first, len(keys)])
+    del keys  # a large map has no room for it beside the packed surfels
     packed = np.empty(len(surfels), PACKED_SURFEL)
     _library().streetfix_pack(byref(frame), surfels.ctypes.data, order.ctypes.data, len(surfels), packed.ctypes.data)
-    key, first, count = np.unique(keys[order], return_index=True, return_counts=True)
-    own = np.zeros(len(key), GRID_REGION)
-    own["key"], own["surfel"], own["surfels"] = key, first, count
-    del keys
-    xyz = _positions(_without_cells(origin, cell_m, own), packed)
+    return PackedSurfels(packed, own, origin, cell_m, reach_m), order
+
+
+def nearest_grid(packed: PackedSurfels) -> NearestGrid:
+    """Build the lookup grid of the surfels of a map.
+
+    It is built region by region. The memory grows with the number of surfels, not with the distances between them.
+
+    Args:
+        packed: the surfels.
+    """
+    origin, cell_m = packed.origin_m, packed.cell_m
+    xyz = _positions(_without_cells(origin, cell_m, packed.regions), packed.surfels)
     regions, blocks, nearest, others = [], [np.zeros(0, GRID_BLOCK)], [np.zeros(0, np.uint16)], [np.zeros(0, np.int32)]
     first_block = first_cell = first_other = 0
-    for region, some, cells in _regions(xyz, own, origin, cell_m, reach_m):
+    for region, some, cells in _regions(xyz, packed.regions, origin, cell_m, packed.reach_m):
         numbers, foreign = _numbered(cells, region)
         region["block"], region["other"], region["others"] = first_block, first_other, len(foreign)
         some["first"] += first_cell
@@ -510,8 +562,7 @@ def packed_map(
     _library().streetfix_fill_slots(whole.ctypes.data, len(whole), slot_bits, slots.ctypes.data)
     # Two bytes are enough unless a region numbers more than 65,536 surfels. Then all numbers of the map take four.
     entries = np.concatenate(nearest)
-    grid = NearestGrid(origin, cell_m, slots, whole, np.concatenate(blocks), entries, np.concatenate(others))
-    return grid, packed, order
+    return NearestGrid(origin, cell_m, slots, whole, np.concatenate(blocks), entries, np.concatenate(others))
 
 
 def _numbered(
@@ -598,12 +649,16 @@ def _touched(
 
     def pairs_of(first: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         xyz = positions[first : first + _CHUNK].astype(np.float64) - origin_m
-        low, high = (np.floor((xyz + sign * reach_m) / region_m).astype(np.int64) for sign in (-1, 1))
-        keys, numbers = [], []
-        for step in product(*(range(int(extent) + 1) for extent in (high - low).max(axis=0))):
-            region = low + step
-            inside = np.flatnonzero((region <= high).all(axis=1))
-            x, y, z = region[inside].T
+        # Axis by axis: NumPy is slow along an axis of three.
+        low, high = (np.floor((xyz.T + sign * reach_m) / region_m).astype(np.int64) for sign in (-1, 1))
+        extent, keys, numbers = high - low, [], []
+        for step in product(*(range(int(most) + 1) for most in extent.max(axis=1))):
+            reached = np.ones(len(xyz), np.bool_)
+            for axis, further in enumerate(step):
+                if further:
+                    reached &= extent[axis] >= further
+            inside = np.flatnonzero(reached)
+            x, y, z = (each[inside] + further for each, further in zip(low, step, strict=True))
             keys.append((x << 2 * KEY_BITS) + (y << KEY_BITS) + z)
             numbers.append(inside + first)
         return np.concatenate(keys), np.concatenate(numbers)

@@ -18,10 +18,12 @@ from service.registration.kernel import (
     PACKED_SURFEL,
     TOLERANCE_M,
     NearestGrid,
+    PackedSurfels,
     QueryPoints,
     SolverOptions,
     align,
-    packed_map,
+    nearest_grid,
+    packed_surfels,
 )
 
 #: Edge of a cell of the lookup grid, and largest distance from a surfel to a cell that refers to it, m.
@@ -80,11 +82,42 @@ class SurfelMap:
             brightness: mean intensity of each surfel's returns, NaN where unknown. An array without a value above 0 comes from a sensor
                 without intensity and counts as None.
         """
-        grid, packed, order = packed_map(surfels, cell_m=CELL_M, reach_m=REACH_M)
+        return cls.of_packed(origin_m, *cls.packed(surfels, brightness))
+
+    @staticmethod
+    def packed(
+        surfels: NDArray[Any], brightness: Float32[NDArray[np.float32], " s"] | None = None
+    ) -> tuple[PackedSurfels, Float16[NDArray[np.float16], " s"] | None]:
+        """Pack the surfels of a map: the first half of ``prepare``. The second half does not need them any more.
+
+        Args:
+            surfels: as of ``prepare``.
+            brightness: as of ``prepare``.
+
+        Returns:
+            The packed surfels, and their intensities as a map holds them.
+        """
+        found, order = packed_surfels(surfels, cell_m=CELL_M, reach_m=REACH_M)
         if brightness is None:
-            return cls(origin_m, packed, grid)
+            return found, None
         half = np.minimum(brightness[order], np.finfo(_BRIGHT).max).astype(_BRIGHT)
-        return cls(origin_m, packed, grid, half if (half > 0).any() else None)
+        return found, half if (half > 0).any() else None
+
+    @classmethod
+    def of_packed(
+        cls,
+        origin_m: Float64[NDArray[np.float64], "3"],
+        packed: PackedSurfels,
+        brightness: Float16[NDArray[np.float16], " s"] | None,
+    ) -> "SurfelMap":
+        """Build the lookup grid of packed surfels: the second half of ``prepare``.
+
+        Args:
+            origin_m: origin of the surfels' frame, map frame, m.
+            packed: the surfels.
+            brightness: their intensities; None if the map has none.
+        """
+        return cls(origin_m, packed.surfels, nearest_grid(packed), brightness)
 
     def unpacked(self, rows: NDArray[np.integer[Any]] | slice) -> NDArray[Any]:
         """Return surfels as numbers: (n,) of ``SURFEL``, in the surfels' frame.

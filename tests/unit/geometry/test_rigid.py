@@ -127,3 +127,15 @@ def test_headings_of_camera_and_body_agree_on_one_vehicle(heading, pitch, roll):
     T_map_camera = transform_from(R_map_body @ R_BODY_OPTICAL, np.zeros(3))
     assert heading_of_body(T_map_body) == pytest.approx(heading, abs=1e-9)
     assert heading_of_camera(T_map_camera) == pytest.approx(heading, abs=1e-9)
+
+
+@given(st.integers(0, 10**6), st.sampled_from([0, 1, 7, 300]))
+def test_transformed_points_are_the_product_and_the_sum_to_the_bit(seed, count):
+    rng = np.random.default_rng(seed)
+    points, T = (
+        rng.uniform(-1e3, 1e3, (count, 3)),
+        transform_from(Rotation.random(rng=rng).as_matrix(), rng.uniform(-1e6, 1e6, 3)),
+    )
+    given_points = points.copy()
+    assert transform_points(T, points).tobytes() == (points @ T[:3, :3].T + T[:3, 3]).tobytes()
+    np.testing.assert_array_equal(points, given_points)

@@ -4,7 +4,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from service.imaging.view_grid import BRIGHTNESS_FLOOR, BRIGHTNESS_LIMIT, brightness
+from service.imaging.view_grid import BRIGHTNESS_FLOOR, BRIGHTNESS_LIMIT, LEAST_BRIGHTNESS_SPREAD, brightness
 
 ALL = np.ones((1, 4), np.bool_)
 VALUES = arrays(np.float32, (4, 6), elements=st.floats(0.0, 255.0, width=32))
@@ -51,3 +51,26 @@ def test_a_view_without_contrast_carries_no_information(values):
 
 def test_a_view_without_a_measured_cell_carries_no_information():
     assert not of([1.0, 2.0, 3.0, 4.0], measured=~ALL).any()
+
+
+def plain_brightness(values, measured, seen):
+    """Compute the brightness with logarithms of all cells."""
+    mean = float(values[measured].mean()) if measured.any() else 0.0
+    if not mean > 0:
+        return np.zeros_like(values)
+    logarithm = np.log(values / np.float32(mean) + np.float32(BRIGHTNESS_FLOOR))
+    middle, spread = float(logarithm[measured].mean()), float(logarithm[measured].std())
+    if spread < LEAST_BRIGHTNESS_SPREAD:
+        return np.zeros_like(values)
+    scaled = np.clip((logarithm - np.float32(middle)) / np.float32(spread), -BRIGHTNESS_LIMIT, BRIGHTNESS_LIMIT)
+    return np.where(seen, scaled, np.float32(0))
+
+
+@given(seed=st.integers(0, 10**6), share=st.sampled_from([0.0, 0.1, 0.7, 1.0]), same=st.booleans())
+def test_brightness_is_that_of_all_cells_to_the_bit(seed, share, same):
+    rng = np.random.default_rng(seed)
+    values = (rng.random((9, 37)) ** 3 * 255).astype(np.float32)
+    measured = rng.random(values.shape) < share
+    seen = measured if same else rng.random(values.shape) < 0.8
+    found = brightness(values, measured=measured, seen=seen)
+    assert found.tobytes() == plain_brightness(values, measured, seen).tobytes()

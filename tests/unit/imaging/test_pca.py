@@ -4,7 +4,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from service.geometry.rigid import rotation_x, rotation_y, rotation_z
-from service.imaging.pca import covariance, level_scan, principal_components, principal_heading, project
+from service.imaging.pca import (
+    _lowest_of_cells,
+    _moments_around,
+    covariance,
+    level_scan,
+    principal_components,
+    principal_heading,
+    project,
+)
 
 
 def cloud(seed, dimensions=3, count=200):
@@ -98,3 +106,51 @@ def test_the_principal_heading_lies_within_half_a_turn():
 def test_a_scan_without_upright_things_has_heading_zero():
     flat = np.random.default_rng(0).uniform([-20, -20, -1.9], [20, 20, -1.7], (500, 3))
     assert principal_heading(flat, height_m=1.8) == 0.0
+
+
+def test_the_lowest_point_of_each_cell_represents_the_ground_by_hand():
+    """Cells of 1 m around (5, 5) and (6, 5), in the order of the cells. Of equally low points of a cell the first counts."""
+    points = np.array(
+        [
+            [6.5, 5.5, -1.7],
+            [5.2, 5.2, -1.6],
+            [5.7, 5.1, -1.9],
+            [5.6, 5.8, -1.9],
+            [6.2, 5.2, -1.5],
+            [5.5, 5.5, -9.0],  # far below the ground
+            [1.0, 1.0, -1.8],  # on the vehicle
+            [17.0, 17.0, -1.8],  # too far away
+        ]
+    )
+    np.testing.assert_array_equal(_lowest_of_cells(points, 1.8, 1.0), points[[2, 0]])
+    np.testing.assert_array_equal(
+        _lowest_of_cells(points.astype(np.float32), 1.8, 1.0), points[[2, 0]].astype(np.float32)
+    )
+
+
+@given(seed=st.integers(0, 10**6), count=st.sampled_from([0, 1, 30, 2000]), rounded=st.booleans())
+def test_the_lowest_points_are_those_of_a_sort(seed, count, rounded):
+    points = np.random.default_rng(seed).normal([0, 0, -1.8], [8, 8, 0.5], (count, 3))
+    points = np.round(2 * points) / 2 if rounded else points
+    radius = np.hypot(points[:, 0], points[:, 1])
+    near = points[(radius > 2) & (radius < 18) & (np.abs(points[:, 2] + 1.8) < 1.0 + 0.12 * radius)]
+    x, y = np.floor(near[:, :2] + 18.0).T
+    order = np.lexsort((near[:, 2], y, x))
+    _, first = np.unique(np.stack([x, y], axis=1)[order], axis=0, return_index=True)
+    np.testing.assert_array_equal(_lowest_of_cells(points, 1.8, 1.0), near[order[first]].reshape(-1, 3))
+
+
+@given(seed=st.integers(0, 10**6), size=st.integers(1, 20), window=st.integers(0, 4), share=st.floats(0, 1))
+def test_moments_around_a_cell_are_those_of_the_cells_in_its_window(seed, size, window, share):
+    """Coordinates about the middle are multiples of a half, so the sums are exact, and so are their means in any order."""
+    occupied = (np.random.default_rng(seed).random((size, size)) < share).astype(np.float64)
+    row, column = np.nonzero(occupied)
+    found = _moments_around(occupied, window)
+    assert found.shape == (4, len(row))
+    x, y = row - size / 2, column - size / 2
+    for k in range(len(row)):
+        inside = np.maximum(np.abs(row - row[k]), np.abs(column - column[k])) <= window
+        count = inside.sum()
+        mx, my = x[inside].sum() / count, y[inside].sum() / count
+        xx, xy, yy = ((a[inside] * b[inside]).sum() / count for a, b in ((x, x), (x, y), (y, y)))
+        np.testing.assert_array_equal(found[:, k], [count, xx - mx * mx, xy - mx * my, yy - my * my])

@@ -1,9 +1,12 @@
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from service.imaging.view_grid import (
     PLANES,
     ViewGrid,
+    fan_planes,
     heights_of,
     panorama_from_points,
     survey_planes,
@@ -180,3 +183,63 @@ def lidar_view(range_m):
 def test_brightness_of_a_survey_view_rises_with_the_intensity():
     planes = survey_planes(lidar_view(10.0), sensor_height_m=1.8, rows_seen=np.ones(9, np.bool_), grid=GRID)
     assert (np.diff(planes[PLANES.index("brightness")], axis=1) > 0).all()
+
+
+def plain_panorama(points, grid):
+    """Compute a panorama as ``panorama_from_points``, with a sort of all points and with whole arrays instead of holes."""
+    x, y, z, intensity = points.T
+    flat = np.hypot(x, y)
+    distance, elevation = np.hypot(flat, z), np.arctan2(z, flat)
+    top, bottom = np.deg2rad(grid.elevation_top_deg), np.deg2rad(grid.elevation_bottom_deg)
+    row_exact = (top - elevation) / (top - bottom) * (grid.rows - 1)
+    column_exact = (np.arctan2(y, x) + np.pi) / (2 * np.pi) * grid.around
+    row, column = np.rint(row_exact).astype(int), np.rint(column_exact).astype(int) % grid.around
+    good = (row >= 0) & (row < grid.rows) & (distance >= grid.min_range_m) & (distance <= grid.max_range_m)
+    off = np.abs(row_exact - row) + np.abs(column_exact - np.rint(column_exact))
+    cells = np.zeros((2, grid.rows, grid.around), np.float32)
+    for k in np.argsort(-off, kind="stable"):  # the nearest last, and of equally near ones the last
+        if good[k]:
+            cells[:, row[k], column[k]] = distance[k], intensity[k]
+    for gap in (1, 2, 3):
+        for offset in range(1, gap + 1):
+            above, below = cells[:, : grid.rows - gap - 1], cells[:, gap + 1 :]
+            hole = cells[:, offset : grid.rows - gap - 1 + offset]
+            agree = (hole[0] == 0) & (above[0] > 0) & (below[0] > 0)
+            agree &= np.abs(above[0] - below[0]) < (0.10 + 0.05 * gap) * np.minimum(above[0], below[0])
+            share = np.float32(offset / (gap + 1))
+            hole[:, agree] = (1 - share) * above[:, agree] + share * below[:, agree]
+    left, right = np.roll(cells, 1, axis=2), np.roll(cells, -1, axis=2)
+    agree = (cells[0] == 0) & (left[0] > 0) & (right[0] > 0)
+    agree &= np.abs(left[0] - right[0]) < 0.10 * np.minimum(left[0], right[0])
+    cells[:, agree] = 0.5 * (left[:, agree] + right[:, agree])
+    return cells
+
+
+@given(seed=st.integers(0, 10**6), count=st.sampled_from([0, 1, 40, 600]), rounded=st.booleans())
+def test_a_panorama_is_numpys_to_the_bit(seed, count, rounded):
+    """With rounded directions many points of a cell are equally near to its ray."""
+    rng = np.random.default_rng(seed)
+    elevation, azimuth = rng.uniform(-18, 18, count), rng.uniform(-180, 180, count)
+    if rounded:
+        elevation, azimuth = np.rint(elevation), 2 * np.rint(azimuth / 2)
+    points = points_at(
+        elevation, azimuth, rng.choice([0.2, 8.0, 9.0, 41.0], count) + rng.random(count), rng.random(count)
+    )
+    found, expected = panorama_from_points(points, GRID), plain_panorama(points, GRID)
+    assert found.tobytes() == expected.tobytes()
+
+
+@given(seed=st.integers(0, 10**6), headings=st.lists(st.floats(-7, 7), max_size=4))
+def test_the_planes_of_a_fan_are_those_of_its_views(seed, headings):
+    rng = np.random.default_rng(seed)
+    panorama = panorama_from_points(
+        points_at(rng.uniform(-18, 18, 400), rng.uniform(-180, 180, 400), rng.uniform(0.3, 45, 400), rng.random(400)),
+        GRID,
+    )
+    rows_seen = rng.random(9) < 0.8
+    found = fan_planes(panorama, np.array(headings), sensor_height_m=1.7, rows_seen=rows_seen, grid=GRID)
+    assert found.shape == (len(headings), len(PLANES), 9, 16)
+    for heading, planes in zip(headings, found, strict=True):
+        view = view_from_panorama(panorama, heading, GRID)
+        expected = survey_planes(view, sensor_height_m=1.7, rows_seen=rows_seen, grid=GRID)
+        np.testing.assert_array_equal(planes, expected)

@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 
 from model_training.datasets.dataset import Dataset
+from model_training.mapping import align_survey
 from model_training.mapping.align_survey import ROUNDS, aligned
 from model_training.mapping.build import build_map
 from model_training.mapping.merge import merge_maps
@@ -152,3 +153,21 @@ def test_a_merged_map_is_aligned_where_both_were(maps, tmp_path):
     merge_maps(maps[True], maps[False], tmp_path / "half")
     assert parameters_of(tmp_path / "both")["survey_aligned"] == 1.0
     assert "survey_aligned" not in parameters_of(tmp_path / "half")
+
+
+@pytest.mark.parametrize("together", [1, 2, 64])
+def test_points_in_voxels_of_several_scans_take_part(monkeypatch, together):
+    """Three scans 1 m apart along x with points in voxels of 0.4 m, however many scans go into the map at once.
+
+    In the map the points lie at x = 0.1, 2.1 and 5.1, at 2.2, 2.3 and 9.1, and at 5.2 m. Voxels start at multiples of 0.4 m from 0.8 m.
+    """
+    monkeypatch.setattr(align_survey, "_TOGETHER", together)
+    unit, y_z = align_survey._UNIT_M, [0.1, 0.1]
+    scans = [
+        np.rint(np.array([[x - number, *y_z] for x in along]) / unit).astype(np.int16)
+        for number, along in enumerate(([0.1, 2.1, 5.1], [2.2, 2.3, 9.1], [5.2]))
+    ]
+    poses = np.stack([transform_from(np.eye(3), np.array([number, 0.0, 0.0])) for number in range(3)])
+    voxels, shared = align_survey._map_of(scans, poses)
+    assert [each.tolist() for each in shared] == [[False, True, True], [True, True, False], [True]]
+    assert voxels.sums()[1][:, 0].tolist() == [1, 3, 2, 1]

@@ -1,5 +1,6 @@
 """Dynamic objects between passes: a street computed by hand, and a simulated one."""
 
+import math
 from types import SimpleNamespace
 from typing import Any
 
@@ -8,7 +9,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from model_training.mapping import passes, work
-from model_training.mapping.passes import MOST, Passes, Targets, Vote, looked_through, tile_of
+from model_training.mapping.passes import MOST, Passes, Targets, Vote, looked_through, tile_of, tiles_within
 from model_training.mapping.settings import BuildSettings
 from model_training.mapping.voxel_map import VoxelMap
 from model_training.mapping.work import BuildCache
@@ -213,7 +214,7 @@ def targets_at(position, normal):
     return Targets.at(cloud_of([position]), np.zeros(1, np.int32), np.array([normal], np.float32))
 
 
-def test_targets_are_found_by_tile_and_by_key():
+def test_targets_are_found_by_tile_and_by_point():
     """Rows 0, 1 and 3 have a surface, and row 2 has none. Row 3 lies in another tile."""
     cloud = cloud_of([[0.5, 0.5, 0.0], [1.5, 1.5, 0.0], [2.5, 2.5, 0.0], [25.5, 0.5, 0.0]])
     found = Targets.at(cloud, np.array([0, 1, 3], np.int32), np.ones((4, 3), np.float32))
@@ -221,15 +222,26 @@ def test_targets_are_found_by_tile_and_by_key():
     assert found.of_tiles(np.array([here])).tolist() == [0, 1]
     assert found.of_tiles(np.sort([here, there, nowhere])).tolist() == [0, 1, 3]
     assert found.of_tiles(np.array([nowhere])).tolist() == []
-    keys, _ = cloud.sums()
-    assert found.with_keys(np.array([keys[0] - 1, keys[1], keys[2], keys[3], keys[3] + 1])).tolist() == [1, 3]
+    points = np.array([[25.6, 0.6, 0.1], [1.5, 1.4, 0.1], [2.5, 2.5, 0.0], [1.4, 1.5, 0.0], [9.0, 9.0, 0.0]])
+    assert found.at_points(points).tolist() == [1, 3]
     assert found.numbers_of(np.array([0, 1, 3])).tolist() == [here, here, there]
 
 
 def test_a_map_without_surfaces_has_no_targets():
     found = Targets.of(VoxelMap(0.3, np.zeros(3)))
     assert found.of_tiles(tile_of(np.zeros((1, 3)))).tolist() == []
-    assert found.with_keys(np.array([5])).tolist() == []
+    assert found.at_points(np.zeros((1, 3))).tolist() == []
+
+
+def test_tiles_within_reach_are_those_with_a_point_in_reach():
+    """From (5, 5), in the tile of the corner (0, 0)."""
+    tiles = tile_of(
+        np.array([[5.0, 5.0], [15.0, 5.0], [25.0, 5.0], [35.0, 5.0], [-25.0, 5.0], [25.0, 25.0], [15.0, 25.0]])
+    )
+    found = tiles_within(tiles, np.array([5.0, 5.0]), 20.0)  # distances: 0, 5, 15, 25, 25, 21.2 and 15.8 m
+    assert found.tolist() == [True, True, True, False, False, False, True]
+    assert tiles_within(tiles[4:5], np.array([5.0, 5.0]), 24.9).tolist() == [False]
+    assert tiles_within(tiles[4:5], np.array([5.0, 5.0]), 25.1).tolist() == [True]
 
 
 @pytest.mark.parametrize(
@@ -316,3 +328,63 @@ def test_the_compiled_vote_is_that_of_a_slow_loop(seed):
     expected = slow_looked_through(targets, points, T_map_lidar, 0.6)
     assert 50 < len(expected) < 390
     assert found.tolist() == expected
+
+
+def cell_by_hand(point):
+    """Return the cell of half a degree of a direction, by the functions of the C library, as the vote states it."""
+    x, y, z = point
+    row = math.floor((math.asin(z / math.sqrt(x * x + y * y + z * z)) * 57.29577951308232 + 45.0) / 0.5)
+    return row, math.floor((math.atan2(y, x) * 57.29577951308232 + 180.0) / 0.5) % 720
+
+
+@pytest.mark.parametrize("azimuth_deg", [-180.0, -135.0, -90.0, -44.5, 0.0, 30.5, 45.0, 90.0, 134.5, 179.5])
+@pytest.mark.parametrize("elevation_deg", [-45.0, -15.0, 0.0, 0.5, 14.5, 44.5])
+def test_rays_on_the_limits_of_cells_belong_to_the_cell_of_the_c_library(azimuth_deg, elevation_deg):
+    """A ray a few roundings beside a corner of four cells. It sees through the voxel in the middle of its own cell only."""
+    azimuth, elevation = np.deg2rad(azimuth_deg), np.deg2rad(elevation_deg)
+    middles = [
+        (np.deg2rad(elevation_deg + up), np.deg2rad(azimuth_deg + left))
+        for up in (-0.25, 0.25)
+        for left in (-0.25, 0.25)
+    ]
+    rays = np.array([[np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)] for e, a in middles])
+    cloud = VoxelMap(0.001, np.zeros(3))  # each voxel in a cell of its own, a point in each
+    cloud.add(8.0 * rays)
+    targets = Targets.at(cloud, np.arange(4, dtype=np.int32), np.zeros((4, 3), np.float32))
+    targets.normals[:] = (rays[0] + rays[3]).astype(np.float32)
+    cells = [cell_by_hand(mean) for mean in cloud.means()]
+    for ulps in range(-3, 4):
+        point = 20.0 * np.array(
+            [np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)]
+        )
+        for _ in range(abs(ulps)):
+            point = np.nextafter(point, np.copysign(np.inf, ulps))
+        row, column = cell_by_hand(point)
+        expected = [k for k, cell in enumerate(cells) if cell == (row, column) and 0 <= row < 180]
+        found = looked_through(targets, np.arange(4, dtype=np.int32), point[None], np.eye(4), behind_m=0.6)
+        assert found.tolist() == expected
+
+
+def test_vertical_rays_and_rays_along_the_axes_have_a_cell_or_none():
+    points = 20.0 * np.array(
+        [[0, 0, 1], [0, 0, -1], [1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0], [-1, -0.0, 0], [0, 0, 0]]
+    )
+    for point in points.astype(np.float64):
+        voxel = 0.5 * point + [0.01, 0.02, 0.03]
+        cloud = VoxelMap(0.3, np.zeros(3))
+        cloud.add(voxel[None])
+        targets = Targets.at(cloud, np.zeros(1, np.int32), np.array([[0.6, 0.0, 0.8]], np.float32))
+        found = looked_through(targets, np.zeros(1, np.int32), point[None], np.eye(4), behind_m=0.6)
+        assert found.tolist() == (slow_looked_through(targets, point[None], np.eye(4), 0.6) if point.any() else [])
+
+
+def test_voxels_out_of_reach_are_not_seen_through():
+    """Along a ray of 60 m, voxels of 0.3 m in steps of 0.1 m around the least and the largest range."""
+    for ranges in (np.arange(1.0, 3.0, 0.1), np.arange(29.0, 31.5, 0.1)):
+        cloud = cloud_of(ranges[:, None] * AHEAD)
+        rows = np.arange(len(cloud.sums()[0]), dtype=np.int32)
+        targets = Targets.at(cloud, rows, np.tile(np.array([1, 0, 0], np.float32), (len(rows), 1)))
+        found = looked_through(targets, rows, 60.0 * AHEAD[None], np.eye(4), behind_m=0.6)
+        away = np.linalg.norm(cloud.means(), axis=1)
+        assert found.tolist() == np.flatnonzero((away > 2.0) & (away <= passes.REACH_M)).tolist()
+        assert 0 < len(found) < len(rows)

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from model_training.mapping.cloud import prepared
 from model_training.mapping.passes import Targets
-from model_training.mapping.voxel_map import VOXEL, VoxelMap, lattice_origin
+from model_training.mapping.voxel_map import SPAN, VOXEL, VoxelMap, lattice_origin
 from service.errors import DatasetError
 
 
@@ -347,8 +347,9 @@ def test_a_map_grows_without_a_copy_of_itself(monkeypatch):
         (lambda voxels: sum(column.sum(dtype=np.float64) for column in voxels.columns().each()), 10),
         (lambda voxels: voxels.statistics(), 72),
         (lambda voxels: Targets.of(voxels), 50),
+        (lambda voxels: prepared(voxels), 90),
     ],
-    ids=["surfaces", "surfels", "columns", "statistics", "targets"],
+    ids=["surfaces", "surfels", "columns", "statistics", "targets", "prepared"],
 )
 def test_bytes_beside_a_large_map(work, most, monkeypatch):
     """A voxel has 56 bytes. A tile of a town has five million, so each byte beside them counts."""
@@ -380,3 +381,108 @@ def test_a_point_at_the_limit_is_added_or_refused(voxel_m, side):
             assert len(voxels.sums()[0]) == before
         else:
             assert voxels.means()[:, 0] == pytest.approx(side * voxels.reach_m, rel=1e-6)
+
+
+def plain_sums(points, intensity, origin, voxel_m):
+    """Compute the sums of points by voxel in NumPy: double precision in the order of the points, then single precision."""
+    cell = np.floor((points - origin) / voxel_m)
+    local = (points - origin) - (cell + 0.5) * voxel_m
+    x, y, z = local.T
+    bright = [np.zeros(len(x))] * 2 if intensity is None else [intensity.astype(np.float64), np.ones(len(x))]
+    moments = np.stack([np.ones(len(x)), x, y, z, x * x, x * y, x * z, y * y, y * z, z * z, *bright], axis=1)
+    shifted = cell.astype(np.int64) + SPAN // 2
+    keys, row_of = np.unique((shifted[:, 0] * SPAN + shifted[:, 1]) * SPAN + shifted[:, 2], return_inverse=True)
+    sums = np.zeros((len(keys), 12))
+    np.add.at(sums, row_of, moments)
+    return keys, sums.astype(np.float32), row_of
+
+
+#: Points near each other and far away, on limits of cells, and in any order.
+random_points = given(
+    seed=st.integers(0, 10**6),
+    count=st.integers(0, 300),
+    voxel_m=st.sampled_from([0.3, 0.4, 1.0]),
+    extent_m=st.sampled_from([0.2, 2.0, 40.0, 90_000.0]),
+    on_limits=st.booleans(),
+)
+
+
+def points_of(seed, count, voxel_m, extent_m, on_limits):
+    rng = np.random.default_rng(seed)
+    points = rng.uniform(-extent_m, extent_m, (count, 3)) * rng.choice([1.0, 0.01], (count, 1))
+    return np.round(points / voxel_m) * voxel_m if on_limits else points
+
+
+@random_points
+def test_the_sums_of_points_are_numpys_to_the_bit(seed, count, voxel_m, extent_m, on_limits):
+    points, origin = points_of(seed, count, voxel_m, extent_m, on_limits), np.array([10.0, -20.0, 0.5])
+    intensity = np.random.default_rng(seed).random(count).astype(np.float32) if seed % 2 else None
+    voxels = VoxelMap(voxel_m, origin)
+    voxels.add(points, intensity)
+    keys, sums, _ = plain_sums(points, intensity, origin, voxel_m)
+    np.testing.assert_array_equal(voxels.sums()[0], keys)
+    assert voxels.sums()[1].tobytes() == sums.tobytes()
+
+
+@random_points
+def test_the_voxels_of_points_are_numpys(seed, count, voxel_m, extent_m, on_limits):
+    points, origin = points_of(seed, count, voxel_m, extent_m, on_limits), np.array([10.0, -20.0, 0.5])
+    half, source = count // 2, np.sort(np.random.default_rng(seed).integers(0, 4, count))
+    known, voxels = VoxelMap(voxel_m, origin), VoxelMap(voxel_m, origin)
+    known.add(points[:half])
+    expected = np.unique(plain_sums(points[half:], None, origin, voxel_m)[0])
+    np.testing.assert_array_equal(known.rows_of(points[half:]), np.flatnonzero(np.isin(known.sums()[0], expected)))
+    keys, sums, row_of = plain_sums(points, None, origin, voxel_m)
+    found, of_several, rows = voxels.add_from(points, source)
+    np.testing.assert_array_equal(found, keys)
+    np.testing.assert_array_equal(rows, row_of)
+    assert of_several.tolist() == [len(set(source[row_of == row])) > 1 for row in range(len(keys))]
+    assert voxels.sums()[1].tobytes() == sums.tobytes()
+
+
+def test_voxels_of_points_by_hand():
+    """Voxels of 1 m along x. Points of the sources 0, 0, 1, 1 and 4 lie in the voxels 2, 0, 2, 0 and 5."""
+    voxels = VoxelMap(1.0, np.zeros(3))
+    points = np.array([[2.5, 0, 0], [0.5, 0, 0], [2.1, 0, 0], [0.2, 0, 0], [5.5, 0, 0]])
+    _, of_several, row_of = voxels.add_from(points[[0, 1, 2, 4]], np.array([0, 0, 1, 4]))
+    assert (of_several.tolist(), row_of.tolist()) == ([False, True, False], [1, 0, 1, 2])
+    assert voxels.rows_of(points[[4, 3, 1]]).tolist() == [0, 2]
+    assert voxels.rows_of(np.array([[1.5, 0, 0], [9.5, 0, 0], [-0.5, 0, 0]])).tolist() == []
+    assert voxels.rows_of(np.zeros((0, 3))).tolist() == []
+    with pytest.raises(DatasetError, match="from the middle"):
+        voxels.rows_of(np.array([[1e9, 0, 0]]))
+
+
+@pytest.mark.parametrize("most", [3, 12, 700])
+def test_merged_sums_are_numpys_to_the_bit(most):
+    """Up to ``most`` voxels receive sums of 3,000 rows, so some receive one row, and some more than 128. Some numbers are -0."""
+    rng = np.random.default_rng(most)
+    voxels, expected = VoxelMap(1.0, np.zeros(3)), {}
+    for _ in range(3):
+        keys = np.r_[rng.integers(0, most, 3000), rng.integers(5000, 5000 + most, 5)]
+        moments = rng.normal(0, 10.0 ** rng.integers(-4, 5, (len(keys), 1)), (len(keys), 12)).astype(np.float32)
+        moments[rng.random(moments.shape) < 0.2] = -0.0
+        for part in np.array_split(np.arange(len(keys)), 7):
+            voxels.add_sums(keys[part], moments[part])
+        order = np.argsort(keys, kind="stable")
+        first = np.flatnonzero(np.r_[True, np.diff(keys[order]) > 0])
+        sums = np.add.reduceat(moments[order], first, axis=0)
+        for key, row in zip(keys[order][first].tolist(), sums, strict=True):
+            expected[key] = expected[key] + row if key in expected else row
+        voxels.sums()  # merges
+    assert voxels.sums()[0].tolist() == sorted(expected)
+    assert voxels.sums()[1].tobytes() == np.stack([expected[key] for key in sorted(expected)]).tobytes()
+
+
+def test_a_surface_does_not_depend_on_the_voxels_that_are_computed_with_it(cloud):
+    """The voxels of a heap take other places among those of two heaps. A flat heap of exact numbers needs no rotation."""
+    flat = np.stack(np.meshgrid(*[np.arange(0.125, 4, 0.25)] * 2, [0.25]), axis=-1).reshape(-1, 3) + [100, -50, 2]
+    for heap in (cloud, flat):
+        alone, both = map_of(heap), map_of(heap, np.random.default_rng(3).uniform(0, 6, (501, 3)) + [60, -50, 2])
+        one, other = alone.surfaces(), both.surfaces()
+        row_of = np.searchsorted(both.sums()[0], alone.sums()[0][one.rows])
+        assert len(other.rows) > len(one.rows) > 32
+        assert one.normals[one.rows].tobytes() == other.normals[row_of].tobytes()
+        assert one.thickness_m[one.rows].tobytes() == other.thickness_m[row_of].tobytes()
+    assert (one.normals[one.rows] == [0, 0, 1]).all()
+    assert (one.thickness_m[one.rows] == 0).all()

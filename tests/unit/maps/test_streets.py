@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from service.errors import BundleError
-from service.maps.streets import Streets
+from service.maps.streets import Streets, _inside
 
 SQUARE = [[0, 0], [10, 0], [10, 10], [0, 10], [0, 0]]
 HOLE = [[4, 4], [6, 4], [6, 6], [4, 6], [4, 4]]
@@ -69,3 +69,25 @@ def test_a_defective_collection_is_refused(spoil: Callable[[dict[str, Any]], obj
     spoil(document)
     with pytest.raises(BundleError, match=r"streets\.geojson"):
         Streets.from_geojson(document)
+
+
+@given(seed=st.integers(0, 10**6), far_m=st.sampled_from([0.0, 1e6]))
+def test_the_box_of_a_street_does_not_change_which_points_it_contains(seed: int, far_m: float) -> None:
+    """Rings of any shape, and points inside, outside, on corners and in line with them."""
+    rng = np.random.default_rng(seed)
+    rings = [np.round(rng.uniform(0, 20, (int(rng.integers(4, 9)), 2))) + far_m for _ in range(2)]
+    street = Streets.from_geojson(
+        collection({"type": "MultiPolygon", "coordinates": [[ring.tolist()] for ring in rings]})
+    )[0]
+    corners = np.concatenate(rings)
+    for point in (
+        *(rng.uniform(-5, 25, (40, 2)) + far_m),
+        *corners,
+        *np.stack([corners[:, 0], corners[::-1, 1]], axis=1),
+    ):
+        assert street.contains(point) == any(_inside(ring, point) for ring in rings)
+
+
+def test_a_street_without_a_polygon_contains_nothing() -> None:
+    streets = Streets.from_geojson(collection({"type": "MultiPolygon", "coordinates": []}))
+    assert streets.index_at(np.array([5.0, 5.0])) == -1

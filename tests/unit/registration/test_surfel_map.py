@@ -330,3 +330,16 @@ def test_a_map_may_have_no_brightness(arrays):
 def test_a_brightness_that_is_none_is_refused(arrays, damage, what):
     arrays["brightness"] = damage(arrays["brightness"])
     refused(arrays, "brightness", what)
+
+
+def test_a_map_made_in_two_halves_is_the_map_made_at_once():
+    rng = np.random.default_rng(4)
+    surfels = np.zeros(500, SURFEL)
+    surfels["xyz"], surfels["normal"] = rng.uniform(-60, 60, (500, 3)), [0, 0, 1]
+    brightness = rng.random(500).astype(np.float32)
+    whole = SurfelMap.prepare(np.zeros(3), surfels, brightness).arrays()
+    packed, half = SurfelMap.packed(surfels, brightness)
+    surfels["xyz"] = 0.0  # the second half does not read them
+    for name, array in SurfelMap.of_packed(np.zeros(3), packed, half).arrays().items():
+        np.testing.assert_array_equal(array, whole[name])
+    assert SurfelMap.packed(surfels)[1] is None
