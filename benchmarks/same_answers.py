@@ -202,25 +202,43 @@ def compare(before: Path, after: Path, leave_out: Sequence[str] = ()) -> int:
 
 
 def work_tree(commit: str, folder: Path) -> None:
-    """Check out a commit beside this one, with the compiled code of this one.
+    """Check out a commit beside this one, with compiled C code: that of this commit if the sources are the same.
 
     Args:
         commit: the commit.
         folder: a folder that does not exist yet.
 
     Raises:
-        ValueError: the commit is unknown, or its C code differs, so that it needs a build of its own.
+        ValueError: the commit is unknown.
+        subprocess.CalledProcessError: its C code cannot be compiled.
     """
     if git("cat-file", "-e", f"{commit}^{{commit}}") is None:
         raise ValueError(f"--before: {commit} is not a commit of this repository")
     changed = changed_programs(commit) or []
-    if compiled := [name for name in changed if name.endswith((".c", ".h")) or name.startswith("native/")]:
-        raise ValueError(f"--before: {compiled[0]} differs, and the check does not compile; measure the rows again")
     if git("worktree", "add", "--detach", str(folder), commit) is None:
         raise ValueError(f"--before: cannot check out {commit} in {folder}")
+    if any(name.endswith((".c", ".h")) or name.startswith("native/") for name in changed):
+        compile_code(folder)
+        return
     for package in ("service", "model_training"):
         for library in (ROOT / package).rglob("*.so"):
             shutil.copy(library, folder / library.relative_to(ROOT))
+
+
+def compile_code(folder: Path) -> None:
+    """Compile the C code of a checked-out commit into its folders, as an editable installation does.
+
+    Args:
+        folder: root of the work tree.
+
+    Raises:
+        subprocess.CalledProcessError: CMake or the compiler failed.
+    """
+    tools, build = Path(sys.executable).parent, folder / "build" / "same_answers"
+    options = (f"-DCMAKE_MAKE_PROGRAM={tools / 'ninja'}", "-DCMAKE_BUILD_TYPE=Release", "-DSKBUILD_STATE=editable")
+    cmake = str(tools / "cmake")
+    subprocess.run([cmake, "-S", str(folder / "native"), "-B", str(build), "-G", "Ninja", *options], check=True)
+    subprocess.run([cmake, "--build", str(build)], check=True)
 
 
 def record(before: str, after: str, queries: dict[str, int], changed: str | None = None) -> dict[str, Any]:
