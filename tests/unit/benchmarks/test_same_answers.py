@@ -92,15 +92,35 @@ def test_changes_that_are_not_committed_are_refused(monkeypatch, capsys):
     assert "commit first" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize(("changed", "what"), [(None, "is not a commit"), ("native/build.ninja", "does not compile")])
-def test_an_unknown_commit_and_other_c_code_are_refused(monkeypatch, capsys, changed, what):
-    answers = {"rev-parse": "f" * 40, "cat-file": None if changed is None else "", "worktree": ""}
+def test_an_unknown_commit_is_refused(monkeypatch, capsys):
+    answers = {"rev-parse": "f" * 40, "cat-file": None, "worktree": ""}
     monkeypatch.setattr(same_answers, "is_dirty", lambda: False)
-    monkeypatch.setattr(same_answers, "changed_programs", lambda _: [changed])
     monkeypatch.setattr(same_answers, "git", lambda command, *_: answers[command])
     with pytest.raises(SystemExit):
         main(["--before", "HEAD"])
-    assert what in capsys.readouterr().err
+    assert "is not a commit" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("changed", ["service/a.py", "service/a.c", "native/CMakeLists.txt"])
+def test_other_c_code_is_compiled_and_equal_c_code_is_copied(tmp_path, monkeypatch, changed):
+    """The stand-in of CMake writes down its arguments, and the repository has one library."""
+    root, tree = tmp_path / "root", tmp_path / "tree"
+    for folder in (root / "service", tree / "service", tmp_path / "bin"):
+        folder.mkdir(parents=True)
+    (root / "service" / "_a.so").write_bytes(b"compiled")
+    cmake, log = tmp_path / "bin" / "cmake", tmp_path / "log"
+    cmake.write_text(f"#!/bin/sh\necho $@ >> {log}\n")
+    cmake.chmod(0o755)
+    monkeypatch.setattr(same_answers, "ROOT", root)
+    monkeypatch.setattr(same_answers, "git", lambda *_: "")
+    monkeypatch.setattr(same_answers, "changed_programs", lambda _: [changed])
+    monkeypatch.setattr("sys.executable", str(tmp_path / "bin" / "python"))
+    same_answers.work_tree("f" * 40, tree)
+    assert (tree / "service" / "_a.so").exists() == (not log.exists()) == (changed == "service/a.py")
+    if log.exists():
+        configure, build = log.read_text().splitlines()
+        assert configure.startswith(f"-S {tree}/native -B {tree}/build/same_answers")
+        assert build == f"--build {tree}/build/same_answers"
 
 
 def test_a_difference_fails_and_leaves_no_record(tmp_path, monkeypatch, capsys):
