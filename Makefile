@@ -51,6 +51,8 @@ TEST_PROCESSES = --numprocesses auto --maxprocesses 4 --dist loadfile --no-loads
 # There is a test process for each core. Further threads of OpenBLAS and torch would wait for each other.
 test test-service: export OMP_NUM_THREADS := 1
 test test-service: export OPENBLAS_NUM_THREADS := 1
+# Where the environment forbids bytecode files, as containers do, each of some hundred test processes compiles all modules again.
+test test-service: export PYTHONDONTWRITEBYTECODE :=
 
 test: .venv/.torch ## all tests, in a process for each core
 	$(BIN)/python -m pytest $(TEST_PROCESSES) $(ARGS)

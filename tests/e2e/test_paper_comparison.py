@@ -9,7 +9,8 @@ METHODS = ("streetfix", "scan_context", "dual", "regression", "cnn_one_space_bot
 
 
 def test_a_little_of_everything_runs_and_goes_on_where_it_was(tmp_path: Path) -> None:
-    size = ("--frames", "96", "--pairs", "64", "--test-images", "6", "--budget-minutes", "0.02")
+    # The fewer frames there are, the more pairs it takes until a batch of them lies near frames. A pair takes longer than a frame.
+    size = ("--frames", "128", "--pairs", "24", "--test-images", "4", "--budget-minutes", "0.01")
     command = [
         sys.executable,
         "-m",

@@ -9,6 +9,7 @@ import pytest
 
 from benchmarks.real.resume import content_of, identical_bundles
 from model_training.simulation.plan import SimulationPlan
+from model_training.simulation.sensor_parameters import LidarParameters
 from model_training.simulation.simulate import simulate
 from service.maps.reader import MapBundle
 
@@ -36,10 +37,17 @@ work._write = kept
 
 @pytest.fixture(scope="module")
 def dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Some 90 scans without queries: a chunk of places and a part of one."""
+    """Some 90 scans of few points, without queries: a chunk of places and a part of one."""
     out = tmp_path_factory.mktemp("resume") / "town"
     plan = SimulationPlan(
-        name="town", seed=3, size_m=(60.0, 60.0), spacing_m=0.8, streets=("1",), lidar="vlp_16", queries=()
+        name="town",
+        seed=3,
+        size_m=(60.0, 60.0),
+        spacing_m=0.8,
+        streets=("1",),
+        lidar="vlp_16",
+        lidar_parameters=LidarParameters(columns=256),
+        queries=(),
     )
     simulate(plan, out, workers=1)
     return out

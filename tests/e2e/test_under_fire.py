@@ -96,12 +96,13 @@ def test_no_request_fails_while_maps_are_swapped(
 
 def _newest(url: str, before: list[str]) -> str:
     until = time.monotonic() + 30
-    while True:
-        (entry,) = httpx.get(f"{url}/v1/maps").json()["maps"]
-        if entry["version"] not in before and len(entry["versions"]) > 1:
-            return str(entry["version"])
-        assert time.monotonic() < until
-        time.sleep(0.02)
+    with httpx.Client(base_url=url) as client:
+        while True:
+            (entry,) = client.get("/v1/maps").json()["maps"]
+            if entry["version"] not in before and len(entry["versions"]) > 1:
+                return str(entry["version"])
+            assert time.monotonic() < until
+            time.sleep(0.02)
 
 
 def test_what_was_asked_before_sigterm_is_answered(start: Any, parts_of: Parts) -> None:

@@ -68,6 +68,12 @@ def serial(monkeypatch):
 
 
 @pytest.fixture(scope="module")
+def small_dataset(sparse_survey):
+    """Replace the dataset of other tests."""
+    return sparse_survey
+
+
+@pytest.fixture(scope="module")
 def tiled(small_dataset, encoder_file, tmp_path_factory):
     out = tmp_path_factory.mktemp("tiled") / "m"
     with pytest.MonkeyPatch.context() as patch:

@@ -79,6 +79,12 @@ def built(dataset: Dataset, encoder: Path, out: Path, settings: BuildSettings = 
 
 
 @pytest.fixture(scope="module")
+def small_dataset(sparse_survey: Dataset) -> Dataset:
+    """Replace the dataset of other tests."""
+    return sparse_survey
+
+
+@pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return tmp_path_factory.mktemp("tiled")
 

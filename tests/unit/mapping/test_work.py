@@ -35,6 +35,12 @@ def files_of(folder):
     return found | {"manifest.json": json.dumps(manifest)}
 
 
+@pytest.fixture(scope="module")
+def small_dataset(sparse_survey):
+    """Replace the dataset of other tests."""
+    return sparse_survey
+
+
 @pytest.fixture
 def small_chunks(monkeypatch):
     monkeypatch.setattr(work, "CHUNK", 3)

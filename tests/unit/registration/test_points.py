@@ -256,7 +256,7 @@ def plain_blocks(depth_m, wanted, noise):
         inverse = np.sort(1 / block[block > 0])
         if len(inverse) >= max(1, (len(block) + 1) // 2):
             low, high = inverse[int(0.1 * (len(inverse) - 1))], inverse[int(0.9 * (len(inverse) - 1))]
-            middle = np.median(inverse)
+            middle = (inverse[(len(inverse) - 1) // 2] + inverse[len(inverse) // 2]) / 2
             if high - low - 2.56 * noise < wanted.edge * middle and 1 / middle < wanted.reach_m:
                 found[at] = 1 / middle
     return found

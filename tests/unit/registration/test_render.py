@@ -80,9 +80,10 @@ def slowly_drawn(grid, surfels, T, camera, *, size_m, reach_m):
     u, v = x[:, 0] / z * camera.fx + camera.cx, x[:, 1] / z * camera.fy + camera.cy
     half = np.minimum(size_m / 2 * camera.fx / z, 4)
     depth = np.full((camera.height, camera.width), 1e9)
-    for row, column in np.ndindex(depth.shape):
-        covers = (np.abs(u - column) <= half) & (np.abs(v - row) <= half)
-        depth[row, column] = z[covers].min(initial=1e9)
+    for row in range(camera.height):
+        of_row = np.abs(v - row) <= half
+        covers = np.abs(u[of_row] - np.arange(camera.width)[:, None]) <= half[of_row]
+        depth[row] = np.where(covers, z[of_row], 1e9).min(axis=1, initial=1e9)
     return np.where(depth > 1e8, 0, depth)
 
 

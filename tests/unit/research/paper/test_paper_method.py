@@ -163,7 +163,7 @@ def test_unmeasured_cells_are_black_in_both_kinds() -> None:
 
 def test_the_cnn_learns_to_separate_the_classes_and_stops(tmp_path: Path) -> None:
     frames = frames_of(96)
-    trainer = CnnTrainer(CnnPlan("aligned", batch=16), frames, None, tmp_path, budget_s=60.0, patience=12)
+    trainer = CnnTrainer(CnnPlan("aligned", batch=8), frames, None, tmp_path, budget_s=60.0, patience=10)
 
     net = trainer.run("test")
 
@@ -202,10 +202,10 @@ def test_a_run_as_the_paper_has_it_goes_on_where_it_was_stopped(
 
 
 def test_every_variant_answers_every_set(tmp_path: Path) -> None:
-    frames, pairs = frames_of(160), pairs_of(60)
+    frames, pairs = frames_of(96), pairs_of(40)
     tests = {"same_drive": pairs_of(6), "other_drive": pairs_of(5)}
 
-    found = run_variant("one_space_both", frames, pairs, tests, frames_of(7, seed=5), tmp_path, budget_s=8.0)
+    found = run_variant("one_space_both", frames, pairs, tests, frames_of(7, seed=5), tmp_path, budget_s=1.0)
 
     assert set(found.answers_by_set) == {
         "lidar.same_drive",

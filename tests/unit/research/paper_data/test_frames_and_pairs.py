@@ -1,5 +1,7 @@
 import json
 import shutil
+from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -8,12 +10,23 @@ import pytest
 from model_training.datasets.dataset import Dataset
 from model_training.simulation.plan import QueryPlan, SimulationPlan
 from model_training.simulation.simulate import simulate
-from research.baselines.paper_data.frames import BLOCK, Frames, make_frames, make_frames_at
+from research.baselines.paper_data import frames as module
+from research.baselines.paper_data.frames import Frames, make_frames, make_frames_at
 from research.baselines.paper_data.pairs import SIDE, Pairs, make_pairs
 from research.baselines.paper_data.table_one import in_proportion
 from service.errors import DatasetError
 
-TOTAL = BLOCK + 22
+BLOCK = 32
+TOTAL = BLOCK + 16
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _small_blocks_of_one_city() -> Iterator[None]:
+    """Make blocks small, and the city once: it takes two seconds."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(module, "BLOCK", BLOCK)
+        patch.setattr(module, "City", cache(module.City))
+        yield
 
 
 @pytest.fixture(scope="module")
@@ -63,7 +76,7 @@ def test_an_unfinished_folder_is_refused(tmp_path: Path) -> None:
 
 def test_frames_at_given_poses_see_another_drive_s_vehicles(folder: Path, tmp_path: Path) -> None:
     frames = Frames.open(folder)
-    rows = np.array([40, 80, 120])
+    rows = np.array([12, 25, 38])
     T, street = np.array(frames.T_map_lidar[rows]), np.array(frames.street[rows])
 
     other = make_frames_at(tmp_path / "other", T, street, traversal=6, workers=1)

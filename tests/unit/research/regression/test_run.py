@@ -38,7 +38,7 @@ def asked(small_dataset, tmp_path_factory):
             small_dataset.folder,
             {"small": pairs},
             folder / "work",
-            budget_s=4.0,
+            budget_s=2.0,
             report=lambda *each: calls.append(each),
             pose=POSE,
             lk=LK,
@@ -64,7 +64,7 @@ def test_a_stage_that_did_not_register_repeats_the_one_before_it(asked):
 
 def test_the_budget_is_shared_three_to_one(asked):
     result, budgets = asked[1], asked[3]
-    assert budgets == {"train_pose": 3.0, "train_lk": 1.0}
+    assert budgets == {"train_pose": 1.5, "train_lk": 0.5}
     assert result.processor_s == sum(cost.processor_s for cost in result.trainings.values())
 
 

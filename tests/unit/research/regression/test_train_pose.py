@@ -32,10 +32,10 @@ def test_a_few_pairs_are_learnt_by_heart(pairs_in_hall):
 
 @pytest.fixture(scope="module")
 def run_in_two_parts(pairs_in_hall, tmp_path_factory):
-    """Return the pairs, and a folder with a training of one second that continued from its checkpoint for another second."""
+    """Return the pairs, and a folder with a training of half a second that continued from its checkpoint for another half."""
     folder, pairs = tmp_path_factory.mktemp("runs") / "googlenet", pairs_in_hall()
-    first = train_pose(pairs, folder, SMALL, budget_s=1.0)
-    second = train_pose(pairs, folder, SMALL, budget_s=first.curve[-1].processor_s + 1.0)
+    first = train_pose(pairs, folder, SMALL, budget_s=0.5)
+    second = train_pose(pairs, folder, SMALL, budget_s=first.curve[-1].processor_s + 0.5)
     return pairs, first, second
 
 
