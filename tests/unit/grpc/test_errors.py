@@ -32,13 +32,27 @@ UNKNOWN_MODEL: dict[str, Any] = {"model": 7, "width": 64, "height": 48, "fx": 32
 UNKNOWN_KIND: dict[str, Any] = {"kind": 9}
 
 
+def settings_of(bundle_path: Path) -> Settings:
+    limits = Limits(max_request_bytes=200_000)
+    return Settings(maps=(bundle_path,), threads=1, queue=1, grpc_streams=1, request_timeout_s=2, limits=limits)
+
+
 @pytest.fixture
 def engine(bundle_path: Path) -> Iterator[Engine]:
-    limits = Limits(max_request_bytes=200_000)
-    engine = Engine.open(
-        Settings(maps=(bundle_path,), threads=1, queue=1, grpc_streams=1, request_timeout_s=2, limits=limits)
-    )
+    engine = Engine.open(settings_of(bundle_path))
     yield engine
+    engine.close()
+
+
+@pytest.fixture(scope="module")
+def refusing(bundle_path: Path) -> Iterator[grpc.Channel]:
+    """A server of the tests whose requests reach no map. One is enough: to open a map takes longer than to refuse a request."""
+    engine = Engine.open(settings_of(bundle_path))
+    server = GrpcServer(engine, host="127.0.0.1", port=0)
+    server.start()
+    with grpc.insecure_channel(f"127.0.0.1:{server.port}") as channel:
+        yield channel
+    server.stop(grace_s=0)
     engine.close()
 
 
@@ -105,10 +119,10 @@ def details(error: Any) -> dict[str, Any]:
     ],
 )
 def test_an_invalid_request_has_error_details(
-    stub: LocalizationServiceStub, request_of: Any, changed: dict[str, Any], code: Any, reason: str, field: str | None
+    refusing: grpc.Channel, request_of: Any, changed: dict[str, Any], code: Any, reason: str, field: str | None
 ) -> None:
     with pytest.raises(grpc.RpcError) as caught:
-        stub.Localize(request_of(**changed))
+        LocalizationServiceStub(refusing).Localize(request_of(**changed))
     assert caught.value.code() == code
     found = details(caught.value)
     assert (found["ErrorInfo"].reason, found["ErrorInfo"].domain) == (reason, "streetfix")
@@ -131,9 +145,9 @@ def test_a_depth_in_millimetres_is_reported_with_its_scale(
     assert "which looks like millimetres; send depth.scale_m = 0.001" in str(caught.value.details())
 
 
-def test_a_message_beyond_the_limit_is_refused(stub: LocalizationServiceStub, request_of: Any) -> None:
+def test_a_message_beyond_the_limit_is_refused(refusing: grpc.Channel, request_of: Any) -> None:
     with pytest.raises(grpc.RpcError) as caught:
-        stub.Localize(request_of(rgb=bytes(300_000)))
+        LocalizationServiceStub(refusing).Localize(request_of(rgb=bytes(300_000)))
     assert caught.value.code() == grpc.StatusCode.RESOURCE_EXHAUSTED
 
 
@@ -167,9 +181,11 @@ def test_a_message_may_be_as_long_as_both_limits_say(
 
 
 @pytest.mark.parametrize("count", [0, 17])
-def test_a_batch_of_none_or_of_too_many_is_refused(stub: LocalizationServiceStub, count: int) -> None:
+def test_a_batch_of_none_or_of_too_many_is_refused(refusing: grpc.Channel, count: int) -> None:
     with pytest.raises(grpc.RpcError) as caught:
-        stub.LocalizeBatch(pb.LocalizeBatchRequest(requests=[pb.LocalizeRequest()] * count))
+        LocalizationServiceStub(refusing).LocalizeBatch(
+            pb.LocalizeBatchRequest(requests=[pb.LocalizeRequest()] * count)
+        )
     assert details(caught.value)["BadRequest"].field_violations[0].field == "requests"
 
 
@@ -310,16 +326,16 @@ def test_health_follows_readiness(channel: grpc.Channel, engine: Engine) -> None
     assert caught.value.code() == grpc.StatusCode.NOT_FOUND
 
 
-def test_health_is_not_watched(channel: grpc.Channel) -> None:
+def test_health_is_not_watched(refusing: grpc.Channel) -> None:
     """A watcher would hold a thread without a key. It would also hold the lock of the standard servicer while it does not read."""
     with pytest.raises(grpc.RpcError) as caught:
-        next(health_pb2_grpc.HealthStub(channel).Watch(health_pb2.HealthCheckRequest()))
+        next(health_pb2_grpc.HealthStub(refusing).Watch(health_pb2.HealthCheckRequest()))
     assert caught.value.code() == grpc.StatusCode.UNIMPLEMENTED
 
 
-def test_reflection(channel: grpc.Channel) -> None:
+def test_reflection(refusing: grpc.Channel) -> None:
     asked = [reflection_pb2.ServerReflectionRequest(list_services="")]
-    (answer,) = reflection_pb2_grpc.ServerReflectionStub(channel).ServerReflectionInfo(iter(asked))
+    (answer,) = reflection_pb2_grpc.ServerReflectionStub(refusing).ServerReflectionInfo(iter(asked))
     assert SERVICE in [service.name for service in answer.list_services_response.service]
     assert SERVICE == "streetfix.v1.LocalizationService"
 
@@ -339,18 +355,18 @@ def raw_call(channel: grpc.Channel, name: str) -> Any:
     return channel.stream_unary(f"/{SERVICE}/{name}", bytes, bytes)
 
 
-def test_a_message_that_is_many_little_ones_is_refused_unparsed(channel: grpc.Channel) -> None:
+def test_a_message_that_is_many_little_ones_is_refused_unparsed(refusing: grpc.Channel) -> None:
     """50,000 empty requests of two bytes each would take a hundred times their size in memory."""
     with pytest.raises(grpc.RpcError) as caught:
-        raw_call(channel, "LocalizeBatch")(iter([b"\x0a\x00" * 50_000]))
+        raw_call(refusing, "LocalizeBatch")(iter([b"\x0a\x00" * 50_000]))
     assert caught.value.code() == grpc.StatusCode.INVALID_ARGUMENT
     assert "more than 64 top-level fields" in str(caught.value.details())
 
 
 @pytest.mark.parametrize("raw", [b"\xff", b"\x0a\x05ab", b"\x0b", b"\x08" + b"\x80" * 11, b"\x09\x00"])
-def test_bytes_that_are_no_message_are_refused(channel: grpc.Channel, raw: bytes) -> None:
+def test_bytes_that_are_no_message_are_refused(refusing: grpc.Channel, raw: bytes) -> None:
     with pytest.raises(grpc.RpcError) as caught:
-        raw_call(channel, "Localize")(iter([raw]))
+        raw_call(refusing, "Localize")(iter([raw]))
     assert caught.value.code() == grpc.StatusCode.INVALID_ARGUMENT
 
 

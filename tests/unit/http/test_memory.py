@@ -23,14 +23,20 @@ AppClient = Callable[[FastAPI], httpx.Client]
 Parts = Callable[..., dict[str, bytes]]
 
 
-@pytest.fixture
-def engine(bundle_path: Path) -> Iterator[Engine]:
+@pytest.fixture(scope="module")
+def opened(bundle_path: Path) -> Iterator[Engine]:
     engine = Engine.open(
         Settings(maps=(bundle_path,), threads=1, limits=Limits(max_request_bytes=4 * MIB), request_timeout_s=5)
     )
-    engine.memory = MemoryBudget(8 * MIB)
     yield engine
     engine.close()
+
+
+@pytest.fixture
+def engine(opened: Engine) -> Engine:
+    """The engine with a memory of the test's own."""
+    opened.memory = MemoryBudget(8 * MIB)
+    return opened
 
 
 @pytest.fixture
