@@ -33,7 +33,8 @@ Parts = Callable[..., dict[str, bytes]]
 WORKERS = 2
 #: Clients of plain HTTP need no authorities. Reading them takes more processor time than a request.
 NO_AUTHORITIES = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
-get, put = (partial(send, verify=NO_AUTHORITIES, timeout=30) for send in (httpx.get, httpx.put))
+get = partial(httpx.get, verify=NO_AUTHORITIES, timeout=30)
+put = partial(httpx.put, verify=NO_AUTHORITIES, timeout=30)
 
 
 class Service:

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from model_training.datasets.dataset import Dataset
+from model_training.simulation.city import City
 from model_training.simulation.plan import QueryPlan, SimulationPlan
 from model_training.simulation.simulate import simulate
 from research.baselines.paper_data import frames as module
@@ -25,7 +26,7 @@ def _small_blocks_of_one_city() -> Iterator[None]:
     """Make blocks small, and the city once: it takes two seconds."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(module, "BLOCK", BLOCK)
-        patch.setattr(module, "City", cache(module.City))
+        patch.setattr(f"{module.__name__}.City", cache(City))
         yield
 
 
