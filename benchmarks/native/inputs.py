@@ -22,7 +22,7 @@ from service.geometry.rigid import R_BODY_OPTICAL, rotation_x, rotation_y, rotat
 from service.imaging import depth16
 from service.imaging.level import level_camera
 from service.imaging.resample import resample
-from service.imaging.view_grid import ViewGrid
+from service.imaging.view_grid import ViewGrid, fan_planes, panorama_from_points
 from service.registration.kernel import (
     STATE,
     SURFEL,
@@ -192,6 +192,18 @@ def _points(rng: np.random.Generator, height: int, width: int) -> list[NDArray[A
     return [np.array(noise), blocks.z_m, points.xyz, points.sigma, points.weight]
 
 
+def _views(rng: np.random.Generator) -> list[NDArray[Any]]:
+    grid = ViewGrid(rows=int(rng.choice([1, 2, 5, 32])), columns=int(rng.choice([1, 3, 128])))
+    count = int(rng.choice([0, 1, 50, 20000]))
+    points = rng.normal(size=(count, 4)).astype(np.float32) * np.float32([20, 20, 2, 1])
+    if rng.random() < 0.3 and count:
+        points[rng.integers(count), 3] = rng.choice([np.nan, np.inf, -1e30, 1e30])
+    panorama = panorama_from_points(points, grid)
+    rows_seen = rng.random(grid.rows) < 0.9
+    headings = rng.uniform(-10, 10, int(rng.choice([0, 1, 24])))
+    return [panorama, fan_planes(panorama, headings, sensor_height_m=1.5, rows_seen=rows_seen, grid=grid)]
+
+
 def _align(rng: np.random.Generator, cloud: SurfelMap) -> list[NDArray[Any]]:
     points, states = points_for(rng), states_for(rng)
     align(cloud.grid, cloud.surfels, points, states, OPTIONS, tolerance_m=0.2)
@@ -295,6 +307,7 @@ def rounds(seed: int, count: int) -> None:
         cases: dict[str, Callable[[], list[NDArray[Any]]]] = {
             "resample": partial(_resample, rng, height, width),
             "level": partial(_level, rng, height, width),
+            "views": partial(_views, rng),
             "points": partial(_points, rng, height, width),
             "align": partial(_align, rng, cloud),
             "render": partial(_render, rng, cloud, height, width),

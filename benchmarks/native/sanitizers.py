@@ -22,7 +22,7 @@ from benchmarks.native.wheels import ROOT, build_wheel, python_in
 TESTS = tuple(
     f"tests/unit/{folder}/test_{name}.py"
     for folder, names in {
-        "imaging": ("decode_depth", "resample", "level", "png16", "ros_depth"),
+        "imaging": ("decode_depth", "resample", "level", "png16", "ros_depth", "view_grid"),
         "registration": ("align", "gradients", "nearest_grid", "points", "rays", "render", "visibility"),
         "mapping": ("passes", "voxel_map"),
     }.items()

@@ -39,6 +39,7 @@ LIBRARIES: Mapping[str, Callable[[], Any]] = {
     "imaging/_depth16.so": partial(_library_of, "service.imaging.depth16", "library"),
     "imaging/_resample.so": partial(_library_of, "service.imaging.resample", "_library"),
     "imaging/_level.so": partial(_library_of, "service.imaging.level", "_library"),
+    "imaging/_view_grid.so": partial(_library_of, "service.imaging.view_grid", "_library"),
 }
 
 

@@ -5,12 +5,21 @@ heading of the view, z up (normal to the local ground). A cell stands for a ray,
 ray through its centre, metres, and 0 means "not measured". Map and query discard ranges beyond ``max_range_m``.
 """
 
+import ctypes
+from ctypes import c_double, c_float, c_int64, c_void_p
 from dataclasses import dataclass, replace
+from functools import cache
+from pathlib import Path
+from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float32, Float64
+from jaxtyping import Bool, Float32, Float64, Int64
 from numpy.typing import NDArray
 
+from service.compiled import load
+
+#: Library that the build compiles from ``view_grid.c``.
+LIBRARY = Path(__file__).with_name("_view_grid.so")
 #: Input planes of the encoder, in this order: range (m), which replaces the intensity. V1 and V2 (grey levels, eq. 9; 0 without
 #: colour). Height above the local ground (m). 1 where the sensor could have measured. Brightness of the LiDAR return or of the
 #: image (``brightness``, standard deviations).
@@ -31,6 +40,29 @@ Panorama = Float32[NDArray[np.float32], "2 rows around"]
 #: Range (m) and intensity (unit of the sensor) of a LiDAR in one view.
 LidarView = Float32[NDArray[np.float32], "2 rows columns"]
 Planes = Float32[NDArray[np.float32], "6 rows columns"]
+
+
+@cache
+def _library() -> ctypes.CDLL:
+    arguments: dict[str, list[Any]] = {
+        "fill": [c_void_p, c_int64, c_int64],
+        "cut": [
+            c_void_p, c_void_p, c_void_p, c_void_p, c_int64, c_int64, c_void_p, c_int64, c_int64,
+            c_float, c_void_p, c_void_p, c_void_p,
+        ],
+        "brighten": [
+            c_void_p, c_int64, c_int64, c_void_p, c_int64, c_int64, c_void_p, c_void_p,
+            c_double, c_double, c_void_p,
+        ],
+    }  # fmt: skip
+    constants = {f"{name.upper()}_ARGUMENTS": len(given) for name, given in arguments.items()}
+    constants |= {"PLANES": len(PLANES), "RANGE": PLANES.index("range_m")}
+    constants |= {"HEIGHT": PLANES.index("height_m"), "BRIGHTNESS": PLANES.index("brightness")}
+    library = load(LIBRARY, constants=constants)
+    for name, given in arguments.items():
+        function = getattr(library, f"streetfix_{name}")
+        function.argtypes, function.restype = given, c_int64 if name == "cut" else None
+    return library
 
 
 @dataclass(frozen=True, slots=True)
@@ -145,43 +177,7 @@ def _fill_between_beams(cells: Float32[NDArray[np.float32], "2 cells"], around: 
         cells: range and intensity of the cells of a panorama, row by row.
         around: number of cells of a row.
     """
-    holes = np.flatnonzero(cells[0] == 0)
-    for gap in (1, 2, 3):
-        for offset in range(1, gap + 1):
-            below = gap + 1 - offset  # rows from the hole to its lower side
-            begin, end = np.searchsorted(holes, [offset * around, cells.shape[1] - below * around])
-            within = holes[begin:end]
-            at, above, under = _on_one_surface(
-                cells[0], within, within - offset * around, within + below * around, 0.10 + 0.05 * gap
-            )
-            share = np.float32(offset / (gap + 1))
-            cells[:, at] = (1 - share) * cells[:, above] + share * cells[:, under]
-            holes = holes[cells[0, holes] == 0]
-    row, column = np.divmod(holes, around)
-    left, right = (row * around + (column + step) % around for step in (-1, 1))
-    at, left, right = _on_one_surface(cells[0], holes, left, right, 0.10)
-    cells[:, at] = 0.5 * (cells[:, left] + cells[:, right])
-
-
-def _on_one_surface(
-    ranges: Float32[NDArray[np.float32], " cells"],
-    holes: NDArray[np.int64],
-    first: NDArray[np.int64],
-    second: NDArray[np.int64],
-    may_differ: float,
-) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
-    """Return the holes whose two sides lie on one surface, and these sides, as indices of cells, (m,) each.
-
-    Args:
-        ranges: range of each cell, metres, 0 in a hole.
-        holes: indices of the holes (n,).
-        first: indices of their first sides (n,).
-        second: indices of their second sides (n,).
-        may_differ: how much the ranges of the sides may differ, as a share of the smaller one.
-    """
-    one, other = ranges[first], ranges[second]
-    agree = (one > 0) & (other > 0) & (np.abs(one - other) < may_differ * np.minimum(one, other))
-    return holes[agree], first[agree], second[agree]
+    _library().streetfix_fill(cells.ctypes.data, cells.shape[1] // around, around)
 
 
 def view_from_panorama(panorama: Panorama, heading_rad: float, grid: ViewGrid) -> LidarView:
@@ -192,13 +188,16 @@ def view_from_panorama(panorama: Panorama, heading_rad: float, grid: ViewGrid) -
         heading_rad: heading of the view from x of the panorama's level frame, counter-clockwise, radians.
         grid: view grid, the one of the panorama.
     """
-    return panorama.take(_columns_at(heading_rad, grid), axis=2)
+    view: LidarView = panorama.take(_columns_at(np.array([heading_rad]), grid)[0], axis=2)
+    return view
 
 
-def _columns_at(heading_rad: float, grid: ViewGrid) -> NDArray[np.int64]:
-    """Return the columns of a panorama that are the columns of the view along a heading (columns,)."""
-    azimuth = heading_rad + grid.azimuths_rad
-    return np.rint((azimuth + np.pi) / (2 * np.pi) * grid.around).astype(np.int64) % grid.around
+def _columns_at(
+    headings_rad: Float64[NDArray[np.float64], " views"], grid: ViewGrid
+) -> Int64[NDArray[np.int64], "views columns"]:
+    """Return the columns of a panorama that are the columns of the views along some headings."""
+    azimuth = headings_rad[:, None] + grid.azimuths_rad
+    return np.asarray(np.rint((azimuth + np.pi) / (2 * np.pi) * grid.around).astype(np.int64) % grid.around)
 
 
 def survey_planes(
@@ -218,7 +217,7 @@ def survey_planes(
         rows_seen: rows that the LiDAR of the survey covers. The other rows are blank in map views and query views (decision 0006).
         grid: view grid.
     """
-    planes: Planes = _planes_of(view, [np.arange(grid.columns)], sensor_height_m, rows_seen, grid)[0]
+    planes: Planes = _planes_of(view, np.arange(grid.columns)[None], sensor_height_m, rows_seen, grid)[0]
     return planes
 
 
@@ -241,28 +240,51 @@ def fan_planes(
         rows_seen: rows that the LiDAR of the survey covers.
         grid: view grid, the one of the panorama.
     """
-    columns = [_columns_at(float(heading_rad), grid) for heading_rad in headings_rad]
-    return _planes_of(panorama, columns, sensor_height_m, rows_seen, grid)
+    return _planes_of(panorama, _columns_at(headings_rad, grid), sensor_height_m, rows_seen, grid)
 
 
 def _planes_of(
     measured: Float32[NDArray[np.float32], "2 rows _"],
-    columns: list[NDArray[np.int64]],
+    columns: Int64[NDArray[np.int64], "views columns"],
     sensor_height_m: float,
     rows_seen: Bool[NDArray[np.bool_], " rows"],
     grid: ViewGrid,
 ) -> Float32[NDArray[np.float32], "views 6 rows columns"]:
     """Compute the planes of views that have some columns of a measurement (range and intensity)."""
-    ranges, intensity = measured
+    ranges, intensity = np.ascontiguousarray(measured, np.float32)
     inside = (ranges >= grid.min_range_m) & (ranges <= grid.max_range_m) & rows_seen[:, None]
     kept = ranges * inside
     height = heights_of(kept, sensor_height_m, grid)
     planes = np.zeros((len(columns), len(PLANES), grid.rows, grid.columns), np.float32)
-    planes[:, 4] = rows_seen[:, None]
-    for view, some in zip(planes, columns, strict=True):
-        seen = inside.take(some, axis=1)
-        view[0], view[3] = kept.take(some, axis=1), height.take(some, axis=1)
-        view[5] = brightness(intensity.take(some, axis=1), measured=seen, seen=seen)
+    planes[:, PLANES.index("observed")] = rows_seen[:, None]
+    shares, counts = np.empty(len(columns) * grid.rows * grid.columns, np.float32), np.empty(len(columns), np.int64)
+    rows, around = ranges.shape
+    views = (columns.ctypes.data, len(columns), grid.columns)
+    count = _library().streetfix_cut(
+        kept.ctypes.data,
+        height.ctypes.data,
+        intensity.ctypes.data,
+        inside.ctypes.data,
+        rows,
+        around,
+        *views,
+        BRIGHTNESS_FLOOR,
+        planes.ctypes.data,
+        shares.ctypes.data,
+        counts.ctypes.data,
+    )
+    logarithms = np.log(shares[:count])  # as for query views: another logarithm rounds otherwise
+    _library().streetfix_brighten(
+        inside.ctypes.data,
+        rows,
+        around,
+        *views,
+        counts.ctypes.data,
+        logarithms.ctypes.data,
+        LEAST_BRIGHTNESS_SPREAD,
+        BRIGHTNESS_LIMIT,
+        planes.ctypes.data,
+    )
     return planes
 
 
@@ -305,16 +327,10 @@ def brightness(
     mean = float(of_measured.mean()) if of_measured.size else 0.0
     if not mean > 0:
         return np.zeros_like(values)
-
-    def logarithm(of: NDArray[np.float32]) -> NDArray[np.float32]:
-        return np.asarray(np.log(of / np.float32(mean) + np.float32(BRIGHTNESS_FLOOR)))
-
-    of_measured = logarithm(of_measured)
-    middle, spread = float(of_measured.mean()), float(of_measured.std())
+    logarithm = np.log(values / np.float32(mean) + np.float32(BRIGHTNESS_FLOOR))
+    middle, spread = float(logarithm[measured].mean()), float(logarithm[measured].std())
     if spread < LEAST_BRIGHTNESS_SPREAD:
         return np.zeros_like(values)
-    of_seen = of_measured if seen is measured else logarithm(values[seen])
-    scaled = (of_seen - np.float32(middle)) / np.float32(spread)
-    result = np.zeros_like(values)
-    result[seen] = np.minimum(np.maximum(scaled, -BRIGHTNESS_LIMIT), BRIGHTNESS_LIMIT)
+    scaled = np.clip((logarithm - np.float32(middle)) / np.float32(spread), -BRIGHTNESS_LIMIT, BRIGHTNESS_LIMIT)
+    result: Float32[NDArray[np.float32], "rows columns"] = np.where(seen, scaled, np.float32(0))
     return result

@@ -456,6 +456,7 @@ static inline void score_one(const Grid *g, const PackedSurfel *surfels, const Q
     s->weight = total;
 }
 
+/* tolerance: 0: the results are not scored. */
 WIDE void streetfix_align(const Grid *g, const PackedSurfel *surfels, const Query *q, const Options *o, double tolerance, double height_min,
                           int64_t count, State *states)
 {
@@ -463,7 +464,7 @@ WIDE void streetfix_align(const Grid *g, const PackedSurfel *surfels, const Quer
     forget(&recent);
     for (int64_t k = 0; k < count; k++) {
         if (o->iterations > 0) align_one(g, surfels, q, o, &recent, states + k);
-        score_one(g, surfels, q, tolerance, height_min, &recent, states + k);
+        if (tolerance > 0) score_one(g, surfels, q, tolerance, height_min, &recent, states + k);
     }
 }
 

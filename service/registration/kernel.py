@@ -387,7 +387,8 @@ def align(
         query: points of the query.
         states: the starts, (n,) of ``STATE``; overwritten with the results.
         options: of the solver; with 0 ``iterations`` the states are only scored.
-        tolerance_m: standard deviation of a point's distance to its surface in the score, m, apart from its noise.
+        tolerance_m: standard deviation of a point's distance to its surface in the score, m, apart from its noise. 0: the results are
+            not scored.
         height_min_m: points lower than this do not count in the score, m. Heights are relative to the camera, along the map's z axis.
     """
     points, given = _as_c(query, options)

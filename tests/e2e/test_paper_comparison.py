@@ -9,7 +9,7 @@ METHODS = ("streetfix", "scan_context", "dual", "regression", "cnn_one_space_bot
 
 
 def test_a_little_of_everything_runs_and_goes_on_where_it_was(tmp_path: Path) -> None:
-    # The fewer frames there are, the more pairs it takes until a batch of them lies near frames. A pair takes longer than a frame.
+    # A batch needs pairs near frames: few pairs need many frames, and a pair takes longer to simulate than a frame.
     size = ("--frames", "128", "--pairs", "24", "--test-images", "4", "--budget-minutes", "0.01")
     command = [
         sys.executable,

@@ -176,9 +176,7 @@ def test_keys_come_and_go_without_a_restart_in_every_worker(start: Start, tmp_pa
 
     def statuses(key: str) -> set[int]:
         """Of new connections, enough for every worker to get some."""
-        plain = ssl.SSLContext(
-            ssl.PROTOCOL_TLS_CLIENT
-        )  # without authorities, whose reading takes longer than a request
+        plain = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)  # to read authorities would take longer than a request
         return {
             httpx.get(f"{service.rest}/v1/maps", headers={"X-Api-Key": key}, verify=plain).status_code
             for _ in range(16)

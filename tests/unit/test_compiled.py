@@ -12,7 +12,7 @@ import service
 from model_training.mapping import passes, voxel_map
 from service.compiled import compiled_layout, declared_layout, load
 from service.errors import StreetfixError
-from service.imaging import depth16, level, resample
+from service.imaging import depth16, level, resample, view_grid
 from service.imaging.as_c import CPicture
 from service.registration import kernel, points, rays, visibility
 
@@ -29,6 +29,7 @@ LIBRARIES = (resample.LIBRARY, level.LIBRARY, kernel.LIBRARY, points.LIBRARY, vi
         visibility._library,
         rays._library,
         depth16.library,
+        view_grid._library,
         voxel_map._library,
         passes._library,
     ],

@@ -154,7 +154,7 @@ def test_every_report_says_what_its_rows_measure_and_that_is_there():
             assert (ROOT / path).exists(), path
 
 
-#: Each benchmark is loaded in a fork of one process, which has loaded the large packages of others.
+#: Loads each benchmark in a fork of one process, which has loaded the large packages.
 _LOADS = """
 import importlib, os, sys
 import matplotlib.pyplot, scipy.spatial, torch
@@ -177,21 +177,18 @@ def loaded():
     command = [sys.executable, "-c", _LOADS, *modules.values()]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
-    found = {module: {Path(file) for file in files} for module, *files in map(_fields, done.stdout.splitlines())}
-    return {report: found[module] for report, module in modules.items()}
-
-
-def _fields(line):
-    return line.split("\t")
+    lines = [line.split("\t") for line in done.stdout.splitlines()]
+    files = {module: {Path(file) for file in loaded} for module, *loaded in lines}
+    return {report: files[module] for report, module in modules.items()}
 
 
 @pytest.mark.parametrize("report", NOT_RUN)
 def test_a_benchmark_does_not_load_what_it_claims_not_to_run(loaded, report):
-    loaded = loaded[report]
-    assert ROOT / "model_training" / "mapping" / "build.py" in loaded
+    files = loaded[report]
+    assert ROOT / "model_training" / "mapping" / "build.py" in files
     for path in {*NOT_RUN[report], *TILED_AND_STORED}:
         assert (ROOT / path).exists(), path
-        assert not [each for each in loaded if each.is_relative_to(ROOT / path)], path
+        assert not [each for each in files if each.is_relative_to(ROOT / path)], path
 
 
 def test_the_maps_of_accuracy_rows_have_no_search_index():

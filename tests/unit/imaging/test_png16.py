@@ -106,9 +106,8 @@ def test_a_damaged_file_says_what_is_wrong(data, says):
 def test_a_bomb_is_inflated_no_further_than_the_picture_needs():
     """A header of 3 x 4 pixels precedes a gigabyte of compressed zeros."""
     packed = zlib.compressobj(wbits=-15)
-    mebibyte = packed.compress(bytes(2**20)) + packed.flush(
-        zlib.Z_FULL_FLUSH
-    )  # may be repeated: it refers to nothing before it
+    # After a full flush nothing refers to earlier data, so the block of a mebibyte may be repeated.
+    mebibyte = packed.compress(bytes(2**20)) + packed.flush(zlib.Z_FULL_FLUSH)
     adler32 = struct.pack(">I", 2**30 % 65521 << 16 | 1)  # of 2**30 zeros
     body = b"\x78\x9c" + 1024 * mebibyte + packed.flush() + adler32
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss

@@ -6,6 +6,7 @@ from hypothesis import strategies as st
 from service.imaging.view_grid import (
     PLANES,
     ViewGrid,
+    brightness,
     fan_planes,
     heights_of,
     panorama_from_points,
@@ -243,3 +244,41 @@ def test_the_planes_of_a_fan_are_those_of_its_views(seed, headings):
         view = view_from_panorama(panorama, heading, GRID)
         expected = survey_planes(view, sensor_height_m=1.7, rows_seen=rows_seen, grid=GRID)
         np.testing.assert_array_equal(planes, expected)
+
+
+@pytest.mark.parametrize("share", [0.0, 0.002, 0.01, 0.1, 0.9])
+@pytest.mark.parametrize("levels", [1, 2, 1000])
+def test_the_brightness_of_a_fan_is_numpys_to_the_bit(share, levels):
+    """Views of 4,096 cells with no measured cell, some, and most. With one level a view carries no information."""
+    grid, rng = ViewGrid(), np.random.default_rng(levels)
+    panorama = np.zeros((2, grid.rows, grid.around), np.float32)
+    panorama[0] = np.where(rng.random(panorama[0].shape) < share, rng.uniform(1, 45, panorama[0].shape), 0)
+    panorama[1] = (1 + rng.integers(0, levels, panorama[0].shape)) * rng.choice([1e-3, 7.0])
+    rows_seen, headings = np.arange(grid.rows) != 5, np.linspace(-3, 3, 7)
+    found = fan_planes(panorama, headings, sensor_height_m=1.7, rows_seen=rows_seen, grid=grid)
+    for heading, planes in zip(headings, found, strict=True):
+        ranges, intensity = view_from_panorama(panorama, heading, grid)
+        inside = (ranges >= grid.min_range_m) & (ranges <= grid.max_range_m) & rows_seen[:, None]
+        assert planes[5].tobytes() == brightness(intensity, measured=inside, seen=inside).tobytes()
+        assert planes[0].tobytes() == (ranges * inside).tobytes()
+        assert planes[3].tobytes() == heights_of(ranges * inside, 1.7, grid).tobytes()
+        np.testing.assert_array_equal(planes[4], np.broadcast_to(rows_seen[:, None], ranges.shape))
+        assert planes[5].any() == (share > 0.001 and levels > 1)
+
+
+def test_a_dark_view_carries_no_brightness():
+    """One view of the fan is dark, and the view after it is not."""
+    panorama = np.full((2, 9, GRID.around), 10.0, np.float32)
+    panorama[1] = np.linspace(1, 20, GRID.around)
+    panorama[1, :, GRID.around // 4 : GRID.around // 2] = 0.0  # azimuths from -90 to 0 degrees
+    headings = np.deg2rad([45.0, -45.0, 135.0])
+    found = fan_planes(panorama, headings, sensor_height_m=1.8, rows_seen=np.ones(9, np.bool_), grid=GRID)
+    assert [planes[5].any() for planes in found] == [True, False, True]
+    assert (found[:, 0] == 10).all()
+
+
+def test_the_order_of_a_panorama_in_memory_changes_nothing():
+    panorama = np.random.default_rng(3).uniform(1, 40, (2, 9, GRID.around)).astype(np.float32)
+    options = {"sensor_height_m": 1.8, "rows_seen": np.ones(9, np.bool_), "grid": GRID}
+    found = [fan_planes(each, np.array([0.0, 2.0]), **options) for each in (panorama, np.asfortranarray(panorama))]
+    np.testing.assert_array_equal(*found)

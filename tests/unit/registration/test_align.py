@@ -110,6 +110,17 @@ def test_without_iterations_nothing_moves_and_the_score_alone_is_written(street_
     assert 0 < found["inliers"][0] < 1
 
 
+def test_without_a_tolerance_all_but_the_score_is_the_same(street_map, seen, pose, start_at):
+    options = SolverOptions(iterations=5, reach=1.0, robust_first=0.5, robust_last=0.1)
+    both = [start_at(turned(pose[0], yaw_deg=2), pose[1] + 0.1) for _ in range(2)]
+    for states, tolerance_m in zip(both, (0.1, 0.0), strict=True):
+        align(street_map.grid, street_map.surfels, seen, states, options, tolerance_m=tolerance_m)
+    for name in set(STATE.names or ()) - {"inliers", "weight"}:
+        np.testing.assert_array_equal(both[0][name], both[1][name])
+    assert both[0]["inliers"][0] > 0.5
+    assert both[1]["inliers"][0] == both[1]["weight"][0] == 0
+
+
 def test_exact_points_score_one_at_their_pose(street_map, seen, pose, start_at):
     # Where two rectangles meet, the nearest surfel may be the other's.
     assert scored(street_map, seen, start_at(*pose))["inliers"][0] > 0.98

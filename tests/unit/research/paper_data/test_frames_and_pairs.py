@@ -23,10 +23,10 @@ TOTAL = BLOCK + 16
 
 @pytest.fixture(scope="module", autouse=True)
 def _small_blocks_of_one_city() -> Iterator[None]:
-    """Make blocks small, and the city once: it takes two seconds."""
+    """Make blocks small, and the city once. It takes two seconds, and comes out the same each time (``test_city.py``)."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(module, "BLOCK", BLOCK)
-        patch.setattr(f"{module.__name__}.City", cache(City))
+        patch.setattr(module, "City", cache(City))
         yield
 
 
