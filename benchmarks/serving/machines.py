@@ -63,6 +63,7 @@ def launch(
         **settings: settings as in the environment, in lower case.
     """
     environment = os.environ | {f"STREETFIX_{name.upper()}": str(value) for name, value in settings.items()}
+    environment.pop("PYTHONDONTWRITEBYTECODE", None)  # as installed: otherwise each start would compile 200 modules
     if temporary is not None:
         environment["TMPDIR"] = str(temporary)
     return subprocess.Popen(

@@ -14,7 +14,7 @@ from service.maps.index import ScannedCopy, Shortlister, ViewIndex
 from service.maps.inverted_file import InvertedFile
 from service.maps.manifest import FILE, TILES_FOLDER, Manifest, read_manifest
 from service.maps.map import Map
-from service.maps.streets import Streets
+from service.maps.streets import Streets, StreetsFile
 from service.registration.surfel_map import SurfelMap
 
 #: Files that every bundle has, apart from the arrays of its cloud.
@@ -32,7 +32,9 @@ class MapBundle(Map):
     cloud: SurfelMap | None
 
     @classmethod
-    def open(cls, path: Path, *, verify: bool = True, compare_hashes: bool = True) -> "MapBundle":
+    def open(
+        cls, path: Path, *, verify: bool = True, compare_hashes: bool = True, known_streets: StreetsFile | None = None
+    ) -> "MapBundle":
         """Open a bundle that ``write_bundle`` wrote. It may lack the files that the service does not read.
 
         Args:
@@ -40,6 +42,7 @@ class MapBundle(Map):
             verify: compare the hash of every file that the service reads with the manifest, and check every index of the cloud and of
                 the inverted file. Sizes and shapes are always checked.
             compare_hashes: False leaves out the hashes, because the caller has compared them.
+            known_streets: streets of a map that has this tile. They are not read again if the tile has the same file.
 
         Raises:
             BundleError: the bundle is missing, damaged, of another format, or inconsistent. The message names the file and
@@ -53,7 +56,7 @@ class MapBundle(Map):
                 field=FILE,
             )
         require_files(path, manifest, NEEDED, verify=verify and compare_hashes)
-        document = read_file(path / streets.FILE) if streets.FILE in manifest.files else None
+        named = read_streets(path, manifest, known_streets)
         bundle = cls(
             path=path,
             manifest=manifest,
@@ -62,8 +65,8 @@ class MapBundle(Map):
             places=map_array(path / parts.PLACES_FILE, expected=parts.PLACE),
             views=map_array(path / parts.VIEWS_FILE, expected=parts.VIEW),
             view_index=_view_index(path, manifest, verify=verify),
-            streets=None if document is None else Streets.from_geojson(json_object(document, path / streets.FILE)),
-            streets_document=document,
+            streets=None if named is None else named.streets,
+            streets_document=None if named is None else named.document,
             calibration=read_calibration(
                 read_file(path / parts.CALIBRATION_FILE), path=str(path / parts.CALIBRATION_FILE)
             ),
@@ -71,6 +74,29 @@ class MapBundle(Map):
         )
         _require_consistent(bundle)
         return bundle
+
+
+def read_streets(path: Path, manifest: Manifest, known: StreetsFile | None = None) -> StreetsFile | None:
+    """Read the streets of a bundle or of a tiled map.
+
+    Args:
+        path: its folder.
+        manifest: its manifest.
+        known: streets that were read before; they are returned if the file is the same.
+
+    Returns:
+        The streets; None if there are none.
+
+    Raises:
+        BundleError: the file cannot be read, or has no valid streets.
+    """
+    entry = manifest.files.get(streets.FILE)
+    if entry is None:
+        return None
+    if known is not None and known.sha256 == entry.sha256:
+        return known
+    document = read_file(path / streets.FILE)
+    return StreetsFile(entry.sha256, document, Streets.from_geojson(json_object(document, path / streets.FILE)))
 
 
 def _view_index(path: Path, manifest: Manifest, *, verify: bool) -> ViewIndex:

@@ -100,6 +100,21 @@ class Streets:
         return next((index for index, street in enumerate(self.features) if street.contains(position)), -1)
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class StreetsFile:
+    """A ``streets.geojson`` that was read.
+
+    Attributes:
+        sha256: hash of the file, as the manifest lists it.
+        document: content of the file.
+        streets: its streets.
+    """
+
+    sha256: str
+    document: bytes
+    streets: Streets
+
+
 def _inside(ring: Ring, position: Float64[NDArray[np.float64], "2"]) -> bool:
     """Check whether a point lies inside a ring by the even-odd rule, with a ray towards positive x."""
     start, end = ring, np.roll(ring, -1, axis=0)

@@ -23,14 +23,14 @@ from service.maps import inverted_file, manifest, streets
 from service.maps.ahead import Ahead
 from service.maps.calibration import read_calibration
 from service.maps.checked_tiles import Checked, CheckedTiles, mark_of
-from service.maps.files import json_object, map_array, read_file, require_files
+from service.maps.files import map_array, read_file, require_files
 from service.maps.index import Shortlister, ViewIndex
 from service.maps.inverted_file import InvertedFile
 from service.maps.joined_index import JoinedRows, JoinedShortlists
-from service.maps.manifest import Manifest, Tile, read_manifest
+from service.maps.manifest import FileEntry, Manifest, Tile, read_manifest
 from service.maps.map import Map
-from service.maps.reader import MapBundle
-from service.maps.streets import Streets
+from service.maps.reader import MapBundle, read_streets
+from service.maps.streets import Streets, StreetsFile
 from service.registration.surfel_map import SurfelMap
 from service.registration.surfel_tiles import SurfelTiles
 
@@ -170,7 +170,8 @@ class OpenTiles:
         source: where the tiles come from.
         verify: check the hash of every file of a tile, and every index in it, when the tile opens, unless ``source.checked`` has these
             files.
-        open_bytes: limit of the size of all open tiles, bytes. At least one tile is open.
+        open_bytes: limit of the size of all open tiles, bytes, without the files that the service does not read. At least one tile is
+            open.
 
     Attributes:
         squares_m: x0, y0, x1, y1 of each tile, map frame, m.
@@ -183,14 +184,14 @@ class OpenTiles:
         self,
         path: Path,
         of_map: Manifest,
-        of_streets: Streets | None,
+        of_streets: StreetsFile | None,
         source: TileSource,
         *,
         verify: bool,
         open_bytes: int,
     ) -> None:
-        self._path, self._manifest, self._source = path, of_map, source
-        self._street_number = street_numbers(of_streets)
+        self._path, self._manifest, self._source, self._streets = path, of_map, source, of_streets
+        self._street_number = street_numbers(None if of_streets is None else of_streets.streets)
         self._verify, self._limit = verify, open_bytes
         self.opens_ahead = False
         self._ahead = Ahead(self._prepare)
@@ -353,19 +354,23 @@ class OpenTiles:
                 with self._changing:
                     if number in self._opened:
                         return
-                    has_room = self._has_room(tile)
+                    has_room = self._has_room(tile.size)  # it counts all files, so there may be more room
                 if not has_room and self._is_checked(tile, self._source.folder(tile, ahead=True)):
                     return
                 made = self._open(tile, ahead=True)
                 with self._changing:
-                    if self._has_room(tile):
+                    if self._has_room(served_bytes(made.manifest.files)):
                         self._opened[number] = made
                         self._opened.move_to_end(number, last=False)  # no query has used it
         finally:
             self._prepared_s[number] = time.monotonic()
 
-    def _has_room(self, tile: Tile) -> bool:
-        return sum(self._manifest.tiles[number].size for number in self._opened) + tile.size <= self._limit
+    def _has_room(self, size: int) -> bool:
+        return self._open_bytes() + size <= self._limit
+
+    def _open_bytes(self) -> int:
+        """Return the size of the files that the open tiles map into memory, bytes."""
+        return sum(served_bytes(bundle.manifest.files) for bundle in self._opened.values())
 
     def _is_checked(self, tile: Tile, folder: Path) -> bool:
         return not self._verify or self._source.checked.get(tile.version, mark_of(folder)) == Checked.ALL
@@ -378,8 +383,7 @@ class OpenTiles:
             return self._opened.get(number)
 
     def _close_some(self) -> None:
-        tiles = self._manifest.tiles
-        while len(self._opened) > 1 and sum(tiles[number].size for number in self._opened) > self._limit:
+        while len(self._opened) > 1 and self._open_bytes() > self._limit:
             closed, _ = self._opened.popitem(last=False)
             self._regions = {key: region for key, region in self._regions.items() if closed not in key}
 
@@ -405,7 +409,12 @@ class OpenTiles:
         if self._verify:
             mark = mark_of(folder)
             checked = self._source.checked.get(tile.version, mark)
-        bundle = MapBundle.open(folder, verify=checked < Checked.ALL, compare_hashes=checked < Checked.HASHES)
+        bundle = MapBundle.open(
+            folder,
+            verify=checked < Checked.ALL,
+            compare_hashes=checked < Checked.HASHES,
+            known_streets=self._streets,  # most tiles have the file of the map
+        )
         if bundle.manifest.version != tile.version:
             raise damaged_file(
                 folder / manifest.FILE, f"version {bundle.manifest.version}, but the map lists {tile.version}"
@@ -435,6 +444,15 @@ def differences(tile: Manifest, of_map: Manifest) -> list[str]:
     if tile.counts.descriptor_size != of_map.counts.descriptor_size:
         found.append("counts.descriptor_size")
     return found
+
+
+def served_bytes(files: Mapping[str, FileEntry]) -> int:
+    """Return the size of the files of a bundle that the service reads, bytes.
+
+    Args:
+        files: files of the bundle by name, as its manifest lists them.
+    """
+    return sum(entry.size for name, entry in files.items() if name not in parts.NOT_SERVED)
 
 
 def street_numbers(of_streets: Streets | None) -> dict[str, int]:
@@ -535,8 +553,7 @@ class TiledMap(Map):
                 f"{path}: a map of one bundle, not a tiled map; open it with open_map", field=manifest.FILE
             )
         require_files(path, read, _NEEDED, verify=verify)
-        document = read_file(path / streets.FILE) if streets.FILE in read.files else None
-        named = None if document is None else Streets.from_geojson(json_object(document, path / streets.FILE))
+        named = read_streets(path, read)
         tiles = OpenTiles(path, read, named, source or LocalTiles(path), verify=verify, open_bytes=open_bytes)
         search = _search(path, read, open_search, verify=verify)
         every, sizes = range(len(tiles)), [tile.counts.views for tile in read.tiles]
@@ -549,8 +566,8 @@ class TiledMap(Map):
             places=map_array(path / parts.PLACES_FILE, expected=parts.PLACE),
             views=np.empty(0, parts.VIEW),
             view_index=ViewIndex(rows, search or JoinedShortlists(sizes, lambda k: tiles.get(k).view_index)),
-            streets=named,
-            streets_document=document,
+            streets=None if named is None else named.streets,
+            streets_document=None if named is None else named.document,
             calibration=read_calibration(
                 read_file(path / parts.CALIBRATION_FILE), path=str(path / parts.CALIBRATION_FILE)
             ),

@@ -46,6 +46,16 @@ def started(monkeypatch: pytest.MonkeyPatch) -> list[subprocess.Popen[str]]:
     return processes
 
 
+def test_a_measured_service_keeps_its_bytecode(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """An installed service has it on the disk. Without it, each start compiles two hundred modules."""
+    given: dict[str, Any] = {}
+    monkeypatch.setenv("PYTHONDONTWRITEBYTECODE", "1")
+    monkeypatch.setattr("subprocess.Popen", lambda _, **arguments: given.update(arguments))
+    machines.launch(tmp_path, threads=2)
+    assert "PYTHONDONTWRITEBYTECODE" not in given["env"]
+    assert given["env"]["STREETFIX_THREADS"] == "2"
+
+
 def test_a_service_that_does_not_stop_is_killed(
     started: list[subprocess.Popen[str]], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:

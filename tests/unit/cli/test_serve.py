@@ -54,6 +54,26 @@ def test_garbage_collection_passes_over_what_was_imported_but_not_over_maps(
     assert gc.get_freeze_count() in (0, before)
 
 
+def test_no_garbage_is_collected_between_the_imports_and_the_maps(
+    bundle_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A fifth of the time of the imports was collection. Afterwards it is on again, also after an error."""
+    collects: dict[str, bool] = {}
+
+    def opening(*_: object, **__: object) -> None:
+        collects["while maps open"] = gc.isenabled()
+        raise RuntimeError("no further")
+
+    monkeypatch.setattr(
+        "service.runtime.logs.set_up", lambda **_: collects.update({"after the imports": gc.isenabled()})
+    )
+    monkeypatch.setattr("service.runtime.engine.Engine.open", opening)
+    with pytest.raises(RuntimeError, match="no further"):
+        serve(Settings(maps=(bundle_path,), port=0))
+    assert collects == {"after the imports": False, "while maps open": True}
+    assert gc.isenabled()
+
+
 def test_check_names_every_bundle_that_cannot_be_mounted(
     bundle_copy: Path, content_of: Callable[..., BundleContent], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

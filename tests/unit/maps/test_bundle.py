@@ -12,7 +12,9 @@ import pytest
 from service.errors import BundleError
 from service.maps import writer
 from service.maps.content import BundleContent
-from service.maps.reader import MapBundle
+from service.maps.manifest import read_manifest
+from service.maps.reader import MapBundle, read_streets
+from service.maps.streets import Streets, StreetsFile
 from service.maps.writer import write_bundle
 
 
@@ -55,6 +57,18 @@ def test_a_map_may_have_no_streets(content_of: Callable[..., BundleContent], tmp
     bundle = MapBundle.open(tmp_path / "m")
     assert bundle.streets is None
     assert b'"features": []' in bundle.streets_geojson()
+
+
+def test_known_streets_are_taken_only_for_the_same_file(bundle_path: Path) -> None:
+    document = (bundle_path / "streets.geojson").read_bytes()
+    known = read_streets(bundle_path, read_manifest(bundle_path))
+    assert known is not None
+    assert known.document == document
+    assert MapBundle.open(bundle_path, known_streets=known).streets is known.streets
+    other = MapBundle.open(bundle_path, known_streets=StreetsFile("0" * 64, b"{}", Streets(())))
+    assert other.streets_document == document
+    assert other.streets is not None
+    assert len(other.streets) == 3
 
 
 def test_the_same_content_has_the_same_version_whenever_it_is_written(content: BundleContent, tmp_path: Path) -> None:

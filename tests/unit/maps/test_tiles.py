@@ -23,10 +23,10 @@ from service.maps import files, inverted_file
 from service.maps import tiles as tiles_module
 from service.maps.ahead import Ahead
 from service.maps.calibration import Site, read_calibration
-from service.maps.manifest import read_manifest
+from service.maps.manifest import FileEntry, read_manifest
 from service.maps.reader import MapBundle
 from service.maps.tiled_writer import joined_site, write_tiled
-from service.maps.tiles import LocalTiles, OpenTiles, TiledMap, expected_next, in_order, open_map
+from service.maps.tiles import LocalTiles, OpenTiles, TiledMap, expected_next, in_order, open_map, served_bytes
 from service.maps.writer import replace_calibration, write_bundle
 from service.registration.surfel_tiles import nearest_square
 from service.retrieval.prior import Prior
@@ -301,6 +301,37 @@ def test_tiles_are_closed_beyond_the_limit(tiled_path: Path, small_dataset: Any)
     assert len(large.tiles.opened) == len(large.tiles)
 
 
+def test_files_that_the_service_does_not_read_do_not_count_as_open(
+    content_of: Callable[..., Any], encoder_of: Callable[..., bytes], tmp_path: Path
+) -> None:
+    """In a town the statistics of the voxels are half of a tile. With them, a service closed tiles that fit."""
+    made, encoder = {(column, 0): tmp_path / str(column) for column in range(2)}, encoder_of()
+    for (column, _), path in made.items():
+        write_bundle(path, content_of(seed=column, encoder=encoder, preview_webp=bytes(1000)))
+    tiles = write_tiled(tmp_path / "two", made, TILE_M, name="two").tiles
+    read = sum(tile.size for tile in tiles) - 2 * 1000
+    for open_bytes, opened in ((read, (0, 1)), (read - 1, (1,))):
+        tiled = TiledMap.open(tmp_path / "two", open_bytes=open_bytes)
+        tiled.tiles.get(0)
+        tiled.tiles.get(1)
+        assert tiled.tiles.opened == opened
+
+
+def test_the_size_of_the_files_that_the_service_reads() -> None:
+    sizes = {"places.npy": 3, "cloud/surfels.npy": 11, "voxels.zst": 100, "preview.webp": 1000}
+    assert served_bytes({name: FileEntry(sha256="0" * 64, size=size) for name, size in sizes.items()}) == 14
+
+
+def test_tiles_with_the_streets_of_their_map_share_them(tiled_path: Path) -> None:
+    tiled = TiledMap.open(tiled_path)
+    of_map = tiled.manifest.files["streets.geojson"]
+    for number, tile in enumerate(tiled.manifest.tiles):
+        opened = tiled.tiles.get(number)
+        assert opened.manifest.files["streets.geojson"] == of_map
+        assert opened.streets is tiled.streets
+        assert opened.streets_document == (tiled_path / tile.folder / "streets.geojson").read_bytes()
+
+
 def test_regions_are_kept_while_their_tiles_are_open(tiled: TiledMap) -> None:
     positions = tiled.tiles.squares_m[:2].reshape(2, 2, 2).mean(axis=1)
     both = np.column_stack([positions, np.zeros(2)])
@@ -376,7 +407,7 @@ def test_the_search_index_chooses_the_tiles_of_a_large_map(
     assert beside.T_map_place[:, 0, 3].tolist() == [10.0] * 12 + [60.0] * 12
 
 
-@pytest.mark.parametrize("name", ["descriptors.npy", "cloud/surfels.npy"])
+@pytest.mark.parametrize("name", ["descriptors.npy", "cloud/surfels.npy", "streets.geojson"])
 def test_a_damaged_tile_is_refused_when_it_opens(tiled_copy: Path, name: str) -> None:
     opened = TiledMap.open(tiled_copy)
     tile = tiled_copy / opened.manifest.tiles[0].folder / name
