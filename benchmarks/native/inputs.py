@@ -195,7 +195,7 @@ def _points(rng: np.random.Generator, height: int, width: int) -> list[NDArray[A
 def _views(rng: np.random.Generator) -> list[NDArray[Any]]:
     grid = ViewGrid(rows=int(rng.choice([1, 2, 5, 32])), columns=int(rng.choice([1, 3, 128])))
     count = int(rng.choice([0, 1, 50, 20000]))
-    points = rng.normal(size=(count, 4)).astype(np.float32) * np.float32([20, 20, 2, 1])
+    points = rng.normal(0, [20, 20, 2, 1], (count, 4)).astype(np.float32)
     if rng.random() < 0.3 and count:
         points[rng.integers(count), 3] = rng.choice([np.nan, np.inf, -1e30, 1e30])
     panorama = panorama_from_points(points, grid)

@@ -279,6 +279,8 @@ def test_a_dark_view_carries_no_brightness():
 
 def test_the_order_of_a_panorama_in_memory_changes_nothing():
     panorama = np.random.default_rng(3).uniform(1, 40, (2, 9, GRID.around)).astype(np.float32)
-    options = {"sensor_height_m": 1.8, "rows_seen": np.ones(9, np.bool_), "grid": GRID}
-    found = [fan_planes(each, np.array([0.0, 2.0]), **options) for each in (panorama, np.asfortranarray(panorama))]
-    np.testing.assert_array_equal(*found)
+    found, other = (
+        fan_planes(each, np.array([0.0, 2.0]), sensor_height_m=1.8, rows_seen=np.ones(9, np.bool_), grid=GRID)
+        for each in (panorama, np.asfortranarray(panorama))
+    )
+    np.testing.assert_array_equal(found, other)
