@@ -140,6 +140,7 @@ class Watch:
         try:
             self._watch()
         except _LostError as lost:
+            _send(self._connections, _FAILED)  # only the first process is connected to all others
             if not self._left.wait(self._grace_s):
                 self._lost(str(lost))
 

@@ -125,6 +125,20 @@ def test_the_first_process_watches_the_others_after_one_has_finished():
     watch.leave(failed=True)
 
 
+def test_the_first_process_tells_the_others_at_once_that_one_was_lost():
+    """It does not wait until it ends itself: otherwise the others would end twice the time of grace after the loss."""
+    (to_second, second), (to_third, third) = socket.socketpair(), socket.socketpair()
+    lost, lost_of_third = Lost(), Lost()
+    watch = Watch([to_second, to_third], lost, grace_s=10 * PATIENCE_S)
+    watch_of_third = Watch([third], lost_of_third, grace_s=0)
+    second.close()
+    assert lost_of_third.called.wait(PATIENCE_S)
+    assert lost_of_third.reason == "another training process has failed"
+    watch.leave(failed=True)
+    watch_of_third.leave(failed=True)
+    assert not lost.called.is_set()
+
+
 def test_all_processes_are_connected_to_the_first_one_and_strangers_are_not():
     keys, stranger = Keys(), socket.socket()
 
