@@ -181,8 +181,8 @@ def joined_streets(
 ) -> dict[str, Any] | None:
     """Join two GeoJSON collections of streets, those of ``a`` first, with one feature per id.
 
-    Two features of one id are the same if their properties are equal and their outlines differ by at most ``SAME_STREET_M``: a survey that
-    was moved into another frame has other roundings. Then that of ``a`` stays.
+    Two features of one id are the same if their properties are equal and no point of an outline lies farther than ``SAME_STREET_M`` from the
+    other outline: a survey that was moved into another frame has other roundings. Then that of ``a`` stays.
 
     Args:
         a: a FeatureCollection; None for no streets.
@@ -212,8 +212,12 @@ def joined_streets(
 def _same_street(a: Mapping[str, Any], b: Mapping[str, Any]) -> bool:
     if a == b or a["properties"] != b["properties"]:
         return a == b
-    first, second = (shapely.boundary(shapely.geometry.shape(each["geometry"])) for each in (a, b))
-    return bool(shapely.hausdorff_distance(first, second) <= SAME_STREET_M)  # NaN, so False, if one is empty
+    try:
+        first, second = (shapely.boundary(shapely.geometry.shape(each["geometry"])) for each in (a, b))
+    except (KeyError, TypeError, ValueError, AttributeError, IndexError, shapely.errors.ShapelyError):
+        return False  # one of them is no street, so they differ
+    # A Hausdorff distance of shapely compares corners only, and two outlines may connect the same corners otherwise.
+    return all(bool(one.buffer(SAME_STREET_M).covers(other)) for one, other in ((first, second), (second, first)))
 
 
 def joined_calibration(a: Mapping[str, Any], b: Mapping[str, Any]) -> dict[str, Any]:

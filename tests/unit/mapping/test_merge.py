@@ -239,6 +239,34 @@ def test_a_street_that_differs_is_refused_unless_the_newer_holds():
     assert joined_streets(collection(b="B"), collection(b="other"), newer=True) == collection(b="other")
 
 
+def outlined(*corners):
+    geometry = {"type": "Polygon", "coordinates": [[*corners, corners[0]]]}
+    return {"type": "FeatureCollection", "features": [{"properties": {"id": "a"}, "geometry": geometry}]}
+
+
+def test_streets_of_one_id_are_the_same_if_their_outlines_lie_within_a_tenth_of_a_metre():
+    street = outlined([0, 0], [5, 5], [10, 0], [10, 10], [0, 10])
+    for y in (-0.09, 0.09):
+        assert joined_streets(street, outlined([0, y], [5, 5], [10, y], [10, 10], [0, 10])) == street
+    with pytest.raises(BundleError, match="both maps have a street 'a', but the two differ"):
+        joined_streets(street, outlined([0, 0.2], [5, 5], [10, 0], [10, 10], [0, 10]))
+
+
+def test_outlines_that_connect_the_same_corners_otherwise_differ():
+    """One square has its notch at the bottom, the other one at the top."""
+    bottom, top = ([0, 0], [5, 5], [10, 0], [10, 10], [0, 10]), ([0, 0], [10, 0], [10, 10], [5, 5], [0, 10])
+    with pytest.raises(BundleError, match="both maps have a street 'a', but the two differ"):
+        joined_streets(outlined(*bottom), outlined(*top))
+
+
+@pytest.mark.parametrize("geometry", [None, {"type": "Polygon", "coordinates": [[["east", 2.0]]]}, {"type": "Polygon"}])
+def test_a_street_without_a_valid_outline_differs(geometry):
+    street = outlined([0, 0], [10, 0], [10, 10])
+    damaged = {"type": "FeatureCollection", "features": [{"properties": {"id": "a"}, "geometry": geometry}]}
+    with pytest.raises(BundleError, match="both maps have a street 'a', but the two differ"):
+        joined_streets(street, damaged)
+
+
 SITE = {"offset": -0.2, "queries": 20, "right": 18, "expected_calibration_error": 0.1}
 
 
