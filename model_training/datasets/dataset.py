@@ -24,7 +24,7 @@ from pydantic import (
 )
 
 from model_training.datasets.files import ROW_BYTES, read_bytes, read_rows, reading, size_of
-from model_training.datasets.frames import MovedFrame, georeference_of
+from model_training.datasets.frames import MovedFrame, georeference_of, require_near
 from service.errors import DatasetError, StreetfixError
 from service.geometry.camera import PinholeCamera
 from service.geometry.rigid import quaternion_xyzw_from, rotation_from_quaternion_xyzw, transform_from
@@ -338,17 +338,22 @@ class Dataset:
             georeference: of the other frame, as in ``dataset.json``. None: unknown.
 
         Raises:
-            DatasetError: a georeference is no place on the Earth, or the poses of the survey are damaged.
+            DatasetError: a georeference is no place on the Earth, the poses of the survey are damaged, or the survey is too far from the
+                origin of the other frame (``FARTHEST_M``).
         """
         own = self.description.georeference
         if own is None or georeference is None or own == georeference:
             return self
         moved_to = georeference_of(georeference, "the map")
         if self.frame is not None:
-            return self.moved(replace(self.frame, moved_to=moved_to))
-        heights_m = self.survey_poses()[:, 2, 3] if self._has_survey() else np.zeros(0)
-        ground_m = float(heights_m.mean()) if len(heights_m) else 0.0
-        return self.moved(MovedFrame(georeference_of(own, f"{self.folder}/dataset.json"), moved_to, ground_m))
+            found = self.moved(replace(self.frame, moved_to=moved_to))
+        else:
+            heights_m = self.survey_poses()[:, 2, 3] if self._has_survey() else np.zeros(0)
+            ground_m = float(heights_m.mean()) if len(heights_m) else 0.0
+            found = self.moved(MovedFrame(georeference_of(own, f"{self.folder}/dataset.json"), moved_to, ground_m))
+        if self._has_survey():
+            require_near(found.survey_poses()[:, :3, 3], str(self.folder))
+        return found
 
     def moved(self, frame: MovedFrame | None) -> Self:
         """Return this dataset with a frame that replaces that of its folder.

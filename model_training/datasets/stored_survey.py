@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from functools import partial
 from hashlib import sha256
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any, BinaryIO, Self
 from uuid import uuid4
 
 import numpy as np
@@ -169,6 +169,18 @@ class _Stored(Dataset):
 
     def _has_survey(self) -> bool:
         return True  # StoredSource.found requires it, and the file may not have been fetched yet
+
+    def in_frame(self, georeference: Mapping[str, Any] | None) -> Self:
+        """Return this dataset in another map frame, as ``Dataset.in_frame``.
+
+        Args:
+            georeference: of the other frame, as in ``dataset.json``. None: unknown.
+
+        Raises:
+            DatasetError: as ``Dataset.in_frame``, or the poses cannot be fetched.
+        """
+        with self._naming_url():
+            return super().in_frame(georeference)
 
     def streets(self) -> dict[str, Any] | None:
         """Return the GeoJSON of the streets, or None if the dataset has none.

@@ -133,6 +133,24 @@ def test_a_frame_that_is_no_place_is_refused(on_earth, wrong):
     assert refused.value.field == "georeference"
 
 
+@pytest.mark.parametrize(("latitude_deg", "is_near"), [(49.29, True), (49.31, False)])
+def test_a_survey_far_from_the_origin_of_a_frame_is_refused(on_earth, latitude_deg, is_near):
+    """A degree of latitude is 111.2 km here. So 0.89 degrees are 99 km, and 0.91 degrees are 101 km."""
+    there = asdict(Georeference(latitude_deg, 9.98, 478.0))
+    if is_near:
+        assert on_earth.in_frame(there).description.georeference == there
+        return
+    for dataset in (on_earth, on_earth.in_frame(asdict(Georeference(48.5, 9.98)))):
+        with pytest.raises(DatasetError, match="the survey lies 101 km from the origin of the map, .* check georeference") as refused:
+            dataset.in_frame(there)
+        assert refused.value.field == "georeference"
+
+
+def test_a_dataset_without_a_survey_has_no_distance(on_earth):
+    (on_earth.folder / "survey" / "poses.txt").unlink()
+    assert on_earth.in_frame(asdict(Georeference(40.7, -74.0))).frame is not None
+
+
 @pytest.mark.parametrize(
     "feature",
     [{"properties": {}}, {"geometry": None}, {"geometry": {"type": "Polygon", "coordinates": [[["east", 2.0]]]}}],

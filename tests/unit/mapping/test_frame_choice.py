@@ -146,6 +146,14 @@ def test_a_survey_in_a_store_is_moved_as_well(surveys: Any, tmp_path: Path) -> N
         assert moved.streets() == expected.streets()
 
 
+def test_the_error_of_a_survey_in_a_store_that_is_far_from_the_map_names_the_url(surveys: Any, tmp_path: Path) -> None:
+    store = tmp_path / "store"
+    shutil.copytree(surveys[0].folder, store, ignore=shutil.ignore_patterns("queries"))
+    with dataset_at(store.as_uri(), tmp_path / "map") as given, pytest.raises(DatasetError) as refused:
+        given.in_frame(asdict(Georeference(40.7, -74.0)))
+    assert refused.value.message.startswith(f"{store.as_uri()}: the survey lies ")
+
+
 @pytest.mark.parametrize("frame", ["global", "maps/other"])
 def test_a_survey_without_a_place_on_the_earth_cannot_be_moved(small_dataset: Dataset, frame: str) -> None:
     with pytest.raises(DatasetError, match=r"georeference is null, .* or give --frame survey") as refused:
