@@ -216,7 +216,11 @@ def survey_planes(
         sensor_height_m: height of the LiDAR above the local ground, metres.
         rows_seen: rows that the LiDAR of the survey covers. The other rows are blank in map views and query views (decision 0006).
         grid: view grid.
+
+    Raises:
+        ValueError: the view has not the shape of the grid.
     """
+    _require_shape(view, rows_seen, grid, grid.columns)
     planes: Planes = _planes_of(view, np.arange(grid.columns)[None], sensor_height_m, rows_seen, grid)[0]
     return planes
 
@@ -239,8 +243,26 @@ def fan_planes(
         sensor_height_m: height of the LiDAR above the local ground, metres.
         rows_seen: rows that the LiDAR of the survey covers.
         grid: view grid, the one of the panorama.
+
+    Raises:
+        ValueError: the panorama has not the shape of the grid.
     """
+    _require_shape(panorama, rows_seen, grid, grid.around)
     return _planes_of(panorama, _columns_at(headings_rad, grid), sensor_height_m, rows_seen, grid)
+
+
+def _require_shape(
+    measured: Float32[NDArray[np.float32], "2 rows _"],
+    rows_seen: Bool[NDArray[np.bool_], " rows"],
+    grid: ViewGrid,
+    columns: int,
+) -> None:
+    """Refuse a measurement of another grid: the C code would read and write outside of the arrays."""
+    if measured.shape != (2, grid.rows, columns) or rows_seen.shape != (grid.rows,):
+        raise ValueError(
+            f"a measurement of the shape {measured.shape} with {len(rows_seen)} rows seen is not one of the view grid: give "
+            f"{(2, grid.rows, columns)} and {grid.rows} rows"
+        )
 
 
 def _planes_of(

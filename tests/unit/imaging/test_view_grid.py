@@ -284,3 +284,15 @@ def test_the_order_of_a_panorama_in_memory_changes_nothing():
         for each in (panorama, np.asfortranarray(panorama))
     )
     np.testing.assert_array_equal(found, other)
+
+
+@pytest.mark.parametrize(("rows", "columns", "seen"), [(0, -1, 0), (0, 1, 0), (1, 0, 1)])
+def test_a_measurement_of_another_grid_is_refused(rows, columns, seen):
+    """With a narrower panorama, the C code would read and write outside of its arrays."""
+    rows_seen = np.ones(GRID.rows + seen, np.bool_)
+    panorama = np.ones((2, GRID.rows + rows, GRID.around + columns), np.float32)
+    view = np.ones((2, GRID.rows + rows, GRID.columns + columns), np.float32)
+    with pytest.raises(ValueError, match="is not one of the view grid: give "):
+        fan_planes(panorama, np.zeros(1), sensor_height_m=1.8, rows_seen=rows_seen, grid=GRID)
+    with pytest.raises(ValueError, match="is not one of the view grid: give "):
+        survey_planes(view, sensor_height_m=1.8, rows_seen=rows_seen, grid=GRID)
