@@ -143,6 +143,7 @@ class VoxelMap:
 
         Raises:
             DatasetError: a point lies beyond the reach of the map.
+            ValueError: an array has another shape.
         """
         self._add(*self._sums_of(points_map, intensity))
 
@@ -194,6 +195,10 @@ class VoxelMap:
         Write the row of the voxel of each point to ``row_of`` (n,).
         """
         points = np.ascontiguousarray(points_map, np.float64)
+        if intensity is not None and intensity.shape != (len(points),):
+            raise ValueError(
+                f"intensity: the shape {intensity.shape} does not fit {len(points)} points; give one number for each point"
+            )
         bright = None if intensity is None else np.ascontiguousarray(intensity, np.float32)
         shape = (len(points), MOMENTS)
         sums, keys, moments = np.empty(shape), np.empty(len(points), np.int64), np.empty(shape, np.float32)
@@ -223,7 +228,10 @@ class VoxelMap:
 
         Raises:
             DatasetError: a point lies beyond the reach of the map.
+            ValueError: the points have another shape.
         """
+        if points.shape != (len(points), 3):
+            raise ValueError(f"points: the shape {points.shape} is not (n, 3)")
         count, slot_bits = len(points), max(1, len(points).bit_length())
         keys, slots = np.empty(count, np.int64), np.empty(1 << slot_bits, np.int32)
         numbers, origin = np.empty((2, count), np.int32), np.ascontiguousarray(self.origin, np.float64)

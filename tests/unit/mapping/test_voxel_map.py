@@ -486,3 +486,15 @@ def test_a_surface_does_not_depend_on_the_voxels_that_are_computed_with_it(cloud
         assert one.thickness_m[one.rows].tobytes() == other.thickness_m[row_of].tobytes()
     assert (one.normals[one.rows] == [0, 0, 1]).all()
     assert (one.thickness_m[one.rows] == 0).all()
+
+
+def test_arrays_of_other_shapes_are_refused():
+    """The C code would read beyond their ends."""
+    voxels = VoxelMap(0.3, np.zeros(3))
+    for intensity in (np.ones(4, np.float32), np.ones((5, 1), np.float32)):
+        with pytest.raises(ValueError, match=r"intensity: the shape .* does not fit 5 points"):
+            voxels.add(np.zeros((5, 3)), intensity)
+    for call in (voxels.add, voxels.rows_of, lambda points: voxels.add_from(points, np.zeros(5, np.int64))):
+        with pytest.raises(ValueError, match=r"points: the shape \(5, 2\) is not \(n, 3\)"):
+            call(np.zeros((5, 2)))
+    assert len(voxels.sums()[0]) == 0
