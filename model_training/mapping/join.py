@@ -181,8 +181,8 @@ def joined_streets(
 ) -> dict[str, Any] | None:
     """Join two GeoJSON collections of streets, those of ``a`` first, with one feature per id.
 
-    Two features of one id are the same if their properties are equal and no point of an outline lies farther than ``SAME_STREET_M`` from the
-    other outline: a survey that was moved into another frame has other roundings. Then that of ``a`` stays.
+    Two features of one id are the same if their properties are equal and no point of an outline lies farther than ``SAME_STREET_M`` from
+    the other outline: a survey that was moved into another frame has other roundings. Then that of ``a`` stays.
 
     Args:
         a: a FeatureCollection; None for no streets.

@@ -141,7 +141,9 @@ def test_a_survey_far_from_the_origin_of_a_frame_is_refused(on_earth, latitude_d
         assert on_earth.in_frame(there).description.georeference == there
         return
     for dataset in (on_earth, on_earth.in_frame(asdict(Georeference(48.5, 9.98)))):
-        with pytest.raises(DatasetError, match="the survey lies 101 km from the origin of the map, .* check georeference") as refused:
+        with pytest.raises(
+            DatasetError, match=r"the survey lies 101 km from the origin of the map, .* check georeference"
+        ) as refused:
             dataset.in_frame(there)
         assert refused.value.field == "georeference"
 
