@@ -658,9 +658,10 @@ def _set_rate(optimiser: torch.optim.Optimizer, config: TrainingConfig, step: in
 
 
 class _Interrupt:
-    """Handle Ctrl-C and SIGTERM: the first ends the run after the step, the second ends it at once.
+    """Handle Ctrl-C and SIGTERM: the first ends the run after the step. A Ctrl-C after that ends it at once.
 
-    torchrun sends SIGTERM before it starts the processes again, and a cluster before it takes a machine away.
+    torchrun sends SIGTERM before it starts the processes again, and a cluster before it takes a machine away. A second SIGTERM changes
+    nothing: systemd and Slurm send one to all processes, and torchrun then sends its own one.
     """
 
     def __init__(self) -> None:
@@ -675,8 +676,8 @@ class _Interrupt:
                 break
         return self
 
-    def _note(self, _signal: int, _frame: FrameType | None) -> None:
-        if self.asked:
+    def _note(self, number: int, _frame: FrameType | None) -> None:
+        if self.asked and number == signal.SIGINT:
             raise KeyboardInterrupt
         self.asked = True
 

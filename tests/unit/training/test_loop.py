@@ -84,6 +84,21 @@ def test_a_run_that_was_interrupted_goes_on_to_the_same_weights(pack_folder, tmp
     assert_same_weights(resumed, run_of(pack_folder, tmp_path / "whole", config))
 
 
+@pytest.mark.parametrize(("second", "saved"), [(signal.SIGTERM, 6), (signal.SIGINT, None)])
+def test_a_second_sigterm_does_not_prevent_the_checkpoint_but_ctrl_c_does(pack_folder, tmp_path, config, second, saved):
+    """A cluster sends SIGTERM to all processes, and torchrun then sends its own one."""
+
+    def interrupt(progress):
+        if progress.step == 6:
+            os.kill(os.getpid(), signal.SIGTERM)
+            os.kill(os.getpid(), second)
+
+    with pytest.raises(KeyboardInterrupt):
+        run_of(pack_folder, tmp_path / "cut", config, report=interrupt)
+    checkpoint = tmp_path / "cut" / "checkpoint.pt"
+    assert (torch.load(checkpoint)["step"] if checkpoint.exists() else None) == saved
+
+
 def test_a_finished_run_is_not_trained_again(pack_folder, tmp_path, config):
     first = run_of(pack_folder, tmp_path / "run", config)
     steps = []
