@@ -168,6 +168,7 @@ def check_only(settings: "Settings") -> None:
     callers = 0 if settings.api_keys is None else len(KeyRing.open(settings.api_keys).caller_of)
     if settings.tls_certificate is not None:
         Certificates.read(settings)
+    gc.enable()  # the imports are done, and many maps may be opened
     engine = Engine.open(settings)
     typer.echo(settings.model_dump_json(indent=2))
     engine.close()

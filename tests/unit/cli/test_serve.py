@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from service.cli.serve import check_only, serve
+from service.cli.serve import check_only, command, serve
 from service.errors import AddressError, BundleError
 from service.maps.content import BundleContent
 from service.maps.writer import write_bundle
@@ -72,6 +72,19 @@ def test_no_garbage_is_collected_between_the_imports_and_the_maps(
         serve(Settings(maps=(bundle_path,), port=0))
     assert collects == {"after the imports": False, "while maps open": True}
     assert gc.isenabled()
+
+
+def test_check_collects_garbage_while_maps_open(bundle_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    collects: list[bool] = []
+
+    def opening(*_: object, **__: object) -> None:
+        collects.append(gc.isenabled())
+        raise RuntimeError("no further")
+
+    monkeypatch.setattr("service.runtime.engine.Engine.open", opening)
+    with pytest.raises(RuntimeError, match="no further"):
+        command(maps=[str(bundle_path)], check=True)
+    assert collects == [True]
 
 
 def test_check_names_every_bundle_that_cannot_be_mounted(
