@@ -355,8 +355,12 @@ class OpenTiles:
                     if number in self._opened:
                         return
                     has_room = self._has_room(tile.size)  # it counts all files, so there may be more room
-                if not has_room and self._is_checked(tile, self._source.folder(tile, ahead=True)):
-                    return
+                if not has_room and self._is_checked(tile, folder := self._source.folder(tile, ahead=True)):
+                    size = served_bytes(read_manifest(folder).files)
+                    with self._changing:
+                        has_room = self._has_room(size)
+                    if not has_room:
+                        return
                 made = self._open(tile, ahead=True)
                 with self._changing:
                     if self._has_room(served_bytes(made.manifest.files)):

@@ -317,6 +317,24 @@ def test_files_that_the_service_does_not_read_do_not_count_as_open(
         assert tiled.tiles.opened == opened
 
 
+def test_a_checked_tile_whose_files_fit_is_opened_ahead(
+    content_of: Callable[..., Any], encoder_of: Callable[..., bytes], tmp_path: Path
+) -> None:
+    """Its files that the service does not read would not fit."""
+    made, encoder = {(column, 0): tmp_path / str(column) for column in range(2)}, encoder_of()
+    for (column, _), path in made.items():
+        write_bundle(path, content_of(seed=column, encoder=encoder, preview_webp=bytes(1000)))
+    tiles = write_tiled(tmp_path / "two", made, TILE_M, name="two").tiles
+    read = sum(tile.size for tile in tiles) - 2 * 1000
+    for open_bytes, opened in ((read, (1, 0)), (read - 1, (0,))):
+        tiled = TiledMap.open(tmp_path / "two", open_bytes=open_bytes)
+        for number in (1, 0):
+            tiled.tiles.get(number)
+        tiled.tiles._opened.pop(1, None)
+        tiled.tiles._prepare(1)
+        assert tiled.tiles.opened == opened
+
+
 def test_the_size_of_the_files_that_the_service_reads() -> None:
     sizes = {"places.npy": 3, "cloud/surfels.npy": 11, "voxels.zst": 100, "preview.webp": 1000}
     assert served_bytes({name: FileEntry(sha256="0" * 64, size=size) for name, size in sizes.items()}) == 14
