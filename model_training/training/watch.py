@@ -62,10 +62,16 @@ def connect(store: KeyStore, rank: int, count: int, host: str, *, within_s: floa
     family = socket.AF_INET6 if both else socket.AF_INET
     connections: list[socket.socket] = []
     with socket.create_server(("", 0), family=family, dualstack_ipv6=both, backlog=count) as server:
-        server.settimeout(within_s)
+        until = time.monotonic() + within_s
         expected = secrets.token_bytes(_PASSWORD_BYTES)
         store.set("watch", f"{server.getsockname()[1]} {expected.hex()}")
         while len(connections) < count - 1:
+            left_s = until - time.monotonic()  # strangers do not prolong it
+            if left_s <= 0:
+                raise TimeoutError(
+                    f"{len(connections) + 1} of {count} training processes connected within {within_s:g} s"
+                )
+            server.settimeout(left_s)
             connection, _ = server.accept()
             if secrets.compare_digest(_first_bytes(connection), expected):
                 connections.append(_without_delay(connection))

@@ -163,6 +163,30 @@ def test_all_processes_are_connected_to_the_first_one_and_strangers_are_not():
         one.close()
 
 
+def test_strangers_do_not_prolong_the_time_to_connect():
+    """One comes after the other, each with a wrong password."""
+    keys, ended = Keys(), threading.Event()
+
+    def disturb():
+        port = int(keys.get("watch").split()[0])
+        while not ended.wait(0.05):
+            try:
+                with socket.create_connection(("127.0.0.1", port), 1) as stranger:
+                    stranger.sendall(bytes(16))
+            except OSError:
+                return  # nobody listens any more
+
+    with ThreadPoolExecutor(2) as pool:
+        disturbing = pool.submit(disturb)
+        first = pool.submit(connect, keys, 0, 2, "localhost", within_s=0.3)
+        try:
+            with pytest.raises(TimeoutError, match=r"timed out|1 of 2 training processes connected within 0\.3 s"):
+                first.result(PATIENCE_S)
+        finally:
+            ended.set()
+        disturbing.result(PATIENCE_S)
+
+
 def test_a_process_that_does_not_connect_in_time_is_an_error():
     with pytest.raises(TimeoutError):
         connect(Keys(), 0, 2, "localhost", within_s=0.05)
