@@ -333,10 +333,18 @@ WHY_MISSED["town.kb_per_metre"] = Reason(
     "that read the margin from their neighbours, and shorter descriptors",
 )
 WHY_MISSED["town.ready_s"] = Reason(
-    2.5708506,
-    "Most of it is processor time of one Python process: imports take 1.1 s, the warm-up query with the tiles that it opens 0.7 s, and "
-    "the command line, settings and contract models the rest. Tried: no HTTP client in the service (112 of 1,144 modules less), and tiles "
-    "that open side by side. Both together gain 0.1 s (medians of six starts in turn). Next step: a warm-up that opens one tile",
+    2.6088408,
+    "Most of it is processor time of one Python process: imports take two fifths, and the tiles of the first query as much. Tried: no "
+    "HTTP client in the service (112 of 1,144 modules less), tiles that open side by side, and decision 0198: no garbage collection during "
+    "imports and one copy of the streets save 0.37 s; hashes in threads beside the imports, and a first query in one tile, do not help. "
+    "Right after the build, with files that were not read yet, it was 3.06 s. Next step: a first query that opens fewer tiles without a "
+    "slower second one",
+)
+WHY_MISSED["town.build_peak_four_towns_over_one"] = Reason(
+    1.1066125,
+    "514 over 464 MiB. A build starts with the largest tiles, two at a time. Of one town the largest tile runs beside the second "
+    "largest. Of four equal towns two copies of the largest run side by side. So the difference does not grow with the survey. Before "
+    "decision 0197 it was 532 over 488 MiB. Next step: a smaller peak of the largest tile (town.build_peak_gib)",
 )
 WHY_MISSED["town.precise.within_1_m"] = Reason(
     0.972,
