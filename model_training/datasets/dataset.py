@@ -339,20 +339,22 @@ class Dataset:
 
         Raises:
             DatasetError: a georeference is no place on the Earth, the poses of the survey are damaged, or the survey is too far from the
-                origin of the other frame (``FARTHEST_M``).
+                origin of the other frame (``FARTHEST_M``). Without a survey, the origin of the dataset's own frame counts.
         """
         own = self.description.georeference
         if own is None or georeference is None or own == georeference:
             return self
         moved_to = georeference_of(georeference, "the map")
         if self.frame is not None:
-            found = self.moved(replace(self.frame, moved_to=moved_to))
+            frame = replace(self.frame, moved_to=moved_to)
         else:
             heights_m = self.survey_poses()[:, 2, 3] if self._has_survey() else np.zeros(0)
             ground_m = float(heights_m.mean()) if len(heights_m) else 0.0
-            found = self.moved(MovedFrame(georeference_of(own, f"{self.folder}/dataset.json"), moved_to, ground_m))
-        if self._has_survey():
-            require_near(found.survey_poses()[:, :3, 3], str(self.folder))
+            frame = MovedFrame(georeference_of(own, f"{self.folder}/dataset.json"), moved_to, ground_m)
+        found = self.moved(frame)
+        # Queries without a survey lie near the origin of their own frame.
+        at = found.survey_poses() if self._has_survey() else frame.poses(np.eye(4)[None])
+        require_near(at[:, :3, 3], str(self.folder))
         return found
 
     def moved(self, frame: MovedFrame | None) -> Self:

@@ -20,7 +20,7 @@ from service.geometry.earth import Georeference
 _STREET_DECIMALS = 4
 #: Origins of global frames for each degree of latitude and of longitude (decision 0195).
 _ORIGINS_PER_DEG = 10
-#: Largest distance between the middle of a survey and the origin of a frame that it is moved into, metres. There up leans by 0.9 degrees.
+#: Largest distance between the middle of a dataset and the origin of a frame that it is moved into, metres. There up leans by 0.9 degrees.
 FARTHEST_M = 1e5
 
 
@@ -98,10 +98,10 @@ def georeference_of(description: Mapping[str, Any], what: str) -> Georeference:
 
 
 def require_near(positions: Float64[NDArray[np.float64], "n 3"], what: str) -> None:
-    """Refuse a survey that is too far from the origin of the frame that it was moved into.
+    """Refuse a dataset that is too far from the origin of the frame that it was moved into.
 
     Args:
-        positions: of the survey in this frame, metres (n, 3).
+        positions: of the survey, or of the dataset's own origin, in this frame, metres (n, 3).
         what: name of the dataset, for the message.
 
     Raises:
@@ -110,7 +110,7 @@ def require_near(positions: Float64[NDArray[np.float64], "n 3"], what: str) -> N
     away_m = float(np.linalg.norm(positions.mean(axis=0))) if len(positions) else 0.0
     if away_m > FARTHEST_M:
         raise DatasetError(
-            f"{what}: the survey lies {away_m / 1000:,.0f} km from the origin of the map, and a map frame is flat, so up would lean there; "
+            f"{what}: the dataset lies {away_m / 1000:,.0f} km from the origin of the map, and a map frame is flat, so up would lean there; "
             f"take a map whose origin is at most {FARTHEST_M / 1000:.0f} km away, or check georeference in dataset.json",
             field="georeference",
         )

@@ -142,15 +142,17 @@ def test_a_survey_far_from_the_origin_of_a_frame_is_refused(on_earth, latitude_d
         return
     for dataset in (on_earth, on_earth.in_frame(asdict(Georeference(48.5, 9.98)))):
         with pytest.raises(
-            DatasetError, match=r"the survey lies 101 km from the origin of the map, .* check georeference"
+            DatasetError, match=r"the dataset lies 101 km from the origin of the map, .* check georeference"
         ) as refused:
             dataset.in_frame(there)
         assert refused.value.field == "georeference"
 
 
-def test_a_dataset_without_a_survey_has_no_distance(on_earth):
+def test_queries_without_a_survey_count_by_the_origin_of_their_frame(on_earth):
     (on_earth.folder / "survey" / "poses.txt").unlink()
-    assert on_earth.in_frame(asdict(Georeference(40.7, -74.0))).frame is not None
+    assert on_earth.in_frame(asdict(Georeference(48.5, 9.98))).frame is not None
+    with pytest.raises(DatasetError, match=r"the dataset lies 6,\d{3} km from the origin of the map"):
+        on_earth.in_frame(asdict(Georeference(40.7, -74.0)))
 
 
 @pytest.mark.parametrize(

@@ -151,7 +151,7 @@ def test_the_error_of_a_survey_in_a_store_that_is_far_from_the_map_names_the_url
     shutil.copytree(surveys[0].folder, store, ignore=shutil.ignore_patterns("queries"))
     with dataset_at(store.as_uri(), tmp_path / "map") as given, pytest.raises(DatasetError) as refused:
         given.in_frame(asdict(Georeference(40.7, -74.0)))
-    assert refused.value.message.startswith(f"{store.as_uri()}: the survey lies ")
+    assert refused.value.message.startswith(f"{store.as_uri()}: the dataset lies ")
 
 
 @pytest.mark.parametrize("frame", ["global", "maps/other"])
