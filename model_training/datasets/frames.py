@@ -110,7 +110,7 @@ def require_near(positions: Float64[NDArray[np.float64], "n 3"], what: str) -> N
     away_m = float(np.linalg.norm(positions.mean(axis=0))) if len(positions) else 0.0
     if away_m > FARTHEST_M:
         raise DatasetError(
-            f"{what}: the dataset lies {away_m / 1000:,.0f} km from the origin of the map, and a map frame is flat, so up would lean there; "
+            f"{what}: the dataset lies {away_m / 1000:,.0f} km from the origin of the map, and a map frame is flat, so up would lean; "
             f"take a map whose origin is at most {FARTHEST_M / 1000:.0f} km away, or check georeference in dataset.json",
             field="georeference",
         )
