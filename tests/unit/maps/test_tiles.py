@@ -301,33 +301,33 @@ def test_tiles_are_closed_beyond_the_limit(tiled_path: Path, small_dataset: Any)
     assert len(large.tiles.opened) == len(large.tiles)
 
 
-def test_files_that_the_service_does_not_read_do_not_count_as_open(
+@pytest.fixture
+def with_unread_files(
     content_of: Callable[..., Any], encoder_of: Callable[..., bytes], tmp_path: Path
-) -> None:
-    """In a town the statistics of the voxels are half of a tile. With them, a service closed tiles that fit."""
+) -> tuple[Path, int]:
+    """Make a map of two tiles, each with 1,000 bytes that the service does not read; return it with the size of its other files."""
     made, encoder = {(column, 0): tmp_path / str(column) for column in range(2)}, encoder_of()
     for (column, _), path in made.items():
         write_bundle(path, content_of(seed=column, encoder=encoder, preview_webp=bytes(1000)))
     tiles = write_tiled(tmp_path / "two", made, TILE_M, name="two").tiles
-    read = sum(tile.size for tile in tiles) - 2 * 1000
+    return tmp_path / "two", sum(tile.size for tile in tiles) - 2 * 1000
+
+
+def test_files_that_the_service_does_not_read_do_not_count_as_open(with_unread_files: tuple[Path, int]) -> None:
+    """In a town the statistics of the voxels are half of a tile. With them, a service closed tiles that fit."""
+    path, read = with_unread_files
     for open_bytes, opened in ((read, (0, 1)), (read - 1, (1,))):
-        tiled = TiledMap.open(tmp_path / "two", open_bytes=open_bytes)
+        tiled = TiledMap.open(path, open_bytes=open_bytes)
         tiled.tiles.get(0)
         tiled.tiles.get(1)
         assert tiled.tiles.opened == opened
 
 
-def test_a_checked_tile_whose_files_fit_is_opened_ahead(
-    content_of: Callable[..., Any], encoder_of: Callable[..., bytes], tmp_path: Path
-) -> None:
+def test_a_checked_tile_whose_files_fit_is_opened_ahead(with_unread_files: tuple[Path, int]) -> None:
     """Its files that the service does not read would not fit."""
-    made, encoder = {(column, 0): tmp_path / str(column) for column in range(2)}, encoder_of()
-    for (column, _), path in made.items():
-        write_bundle(path, content_of(seed=column, encoder=encoder, preview_webp=bytes(1000)))
-    tiles = write_tiled(tmp_path / "two", made, TILE_M, name="two").tiles
-    read = sum(tile.size for tile in tiles) - 2 * 1000
+    path, read = with_unread_files
     for open_bytes, opened in ((read, (1, 0)), (read - 1, (0,))):
-        tiled = TiledMap.open(tmp_path / "two", open_bytes=open_bytes)
+        tiled = TiledMap.open(path, open_bytes=open_bytes)
         for number in (1, 0):
             tiled.tiles.get(number)
         tiled.tiles._opened.pop(1, None)
