@@ -65,13 +65,14 @@ def times_of(localizer: Localizer, frame: QueryFrame) -> dict[str, Pair]:
 
     Raises:
         AssertionError: a compiled function gives another result than NumPy.
-        ValueError: the map has no cloud.
+        ValueError: the map has no cloud, or is tiled.
     """
-    if localizer.bundle.cloud is None:
-        raise ValueError(f"{localizer.bundle.path} has no cloud; build the map with one")
+    cloud = localizer.bundle.cloud
+    if not isinstance(cloud, SurfelMap):
+        raise ValueError(f"{localizer.bundle.path} is tiled or has no cloud; build a map of one bundle with one")
     query = frame.query(localizer.bundle.grid)
     return _of_imaging(query, localizer.bundle.grid, frame.depth_path.read_bytes()) | _of_registration(
-        localizer, localizer.bundle.cloud.at(localizer.bundle.T_map_place[0, :3, 3]), query
+        localizer, cloud, query
     )
 
 
@@ -117,9 +118,8 @@ def _of_registration(localizer: Localizer, cloud: SurfelMap, query: Query) -> di
     states["t"] = states["anchor"] = [each.camera_m - cloud.origin_m for each in starts]
     states["up"] = [0.0, 0.0, 1.0]
     step, after = replace(settings.registration.coarse, iterations=1), states.copy()
-    solver = (cloud.grid, cloud.surfels, points)
-    align(*solver, after, step)
-    H, _ = plain.information(*solver, states, step)
+    align(cloud.pieces, points, after, step)
+    H, _ = plain.information(cloud.grid, cloud.surfels, points, states, step)
     np.testing.assert_allclose(after["information"], H, rtol=1e-6, atol=1e-9 * np.abs(H).max())
     picture, raycaster = measured[0].picture, SurfelRaycaster(cloud, settings.rays)
     pose = rays._State(starts[0].R_map_level, starts[0].camera_m - cloud.origin_m, 0.0, 0.0)
@@ -132,7 +132,8 @@ def _of_registration(localizer: Localizer, cloud: SurfelMap, query: Query) -> di
     np.testing.assert_allclose(adjusted.H, expected, rtol=1e-6, atol=1e-9 * np.abs(expected).max())
     return {
         "kernel.py: one step of all starts": _both(
-            lambda: align(*solver, states.copy(), step), lambda: plain.information(*solver, states, step)
+            lambda: align(cloud.pieces, points, states.copy(), step),
+            lambda: plain.information(cloud.grid, cloud.surfels, points, states, step),
         ),
         "rays.py: rays of one image": _both(
             lambda: raycaster._cast(T, camera),

@@ -206,11 +206,11 @@ def _views(rng: np.random.Generator) -> list[NDArray[Any]]:
 
 def _align(rng: np.random.Generator, cloud: SurfelMap) -> list[NDArray[Any]]:
     points, states = points_for(rng), states_for(rng)
-    align(cloud.grid, cloud.surfels, points, states, OPTIONS, tolerance_m=0.2)
+    align(cloud.pieces, points, states, OPTIONS, tolerance_m=0.2)
     found = [states[name] for name in states.dtype.names or ()]
     for state in states[:1]:
         patch = (np.arange(len(points)) // 7).astype(np.int32)
-        found.append(gradients(cloud.grid, cloud.surfels, points, states[:1], OPTIONS, patch))
+        found.append(gradients(cloud.pieces, points, states[:1], OPTIONS, patch))
         del state
     grid = cloud.grid
     return [*found, cloud.surfels, grid.slots, grid.regions, grid.blocks, grid.nearest, grid.others]
@@ -221,8 +221,7 @@ def _render(rng: np.random.Generator, cloud: SurfelMap, height: int, width: int)
     camera = camera_of(rng, height, width)
     T = transform_from(rotation_of(rng) @ R_BODY_OPTICAL, rng.uniform(-20, 20, 3))
     drawn = render(
-        cloud.grid,
-        cloud.surfels,
+        cloud.pieces,
         T_map_camera=T,
         camera=camera,
         size_m=rng.uniform(0.05, 2),

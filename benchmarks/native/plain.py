@@ -142,7 +142,7 @@ def noise_of(depth_m: NDArray[np.float32]) -> float:
 
 
 def surfels_of_cells(grid: NearestGrid, cells: NDArray[np.int64]) -> NDArray[np.int32]:
-    """Return the surfel of each cell of a lookup grid as ``NearestGrid.surfels_at`` does; -1 for none.
+    """Return the surfel of each cell of a lookup grid as ``kernel.surfels_at`` does; -1 for none.
 
     Args:
         grid: lookup grid of the map, with at least one region.

@@ -29,6 +29,7 @@ from service.errors import ExtraMissingError
 from service.geometry.rigid import Transform
 from service.localization.localizer import Localizer
 from service.maps.calibration import RIGHT_M
+from service.registration.surfel_map import SurfelMap
 
 NEAR_PLACE_M = 5.0
 Locate = Callable[[QueryFrame, int], Transform | None]
@@ -68,7 +69,7 @@ def peer_rows(
         Forced share within 1 m of the best other method, that of our method, and the number of queries.
 
     Raises:
-        ValueError: the map has no cloud.
+        ValueError: the map has no cloud, or is tiled.
     """
     frames = list(dataset.queries(query_set))
     true_xy = np.array([frame.T_map_camera[:2, 3] for frame in frames if frame.T_map_camera is not None])
@@ -77,9 +78,8 @@ def peer_rows(
     errors = position_errors(ours)
     best = ("", -1.0)
     cloud = localizer.bundle.cloud
-    if cloud is None:
-        raise ValueError(f"the map of {name} has no cloud")
-    cloud = cloud.at(localizer.bundle.T_map_place[0, :3, 3])
+    if not isinstance(cloud, SurfelMap):
+        raise ValueError(f"the map of {name} is tiled or has no cloud")
     points = cloud.origin_m + cloud.unpacked(np.s_[:])["xyz"].astype(np.float64)
     map_points = thinned_to_voxels(points, 0.25)
 

@@ -15,7 +15,7 @@ from benchmarks.scale.sources import city_plan
 from model_training.datasets.dataset import Dataset
 from model_training.mapping.join import of_places
 from model_training.mapping.stored_map import content_of
-from model_training.mapping.tiles import TILE_MARGIN_M
+from model_training.mapping.tile_area import Square, TileArea, cloud_of_tile
 from service.localization.localizer import Localizer
 from service.maps.content import BundleContent
 from service.maps.reader import MapBundle
@@ -72,8 +72,8 @@ def shifted_maps(city: MapBundle, folder: Path) -> tuple[list[Float64[NDArray[np
     corner = np.full(2, TILE_M - BEYOND_M)
     home = corner - city.T_map_place[:, :2, 3].min(axis=0)
     between = [APART * TILE_M * np.array([column, row]) for column in range(SIDE) for row in range(SIDE)]
-    tiles = tiles_of(_moved(_served(city), home))
-    maps = {ONE: _tiled(tiles, between[:1], folder / ONE), MANY: _tiled(tiles, between, folder / MANY)}
+    moved = _moved(_served(city), home)
+    maps = {ONE: _tiled(moved, between[:1], folder / ONE), MANY: _tiled(moved, between, folder / MANY)}
     return [home + shift for shift in between], maps
 
 
@@ -155,7 +155,7 @@ def _queries(dataset: Dataset, city: MapBundle) -> list[tuple[Query, NDArray[np.
 
 
 def tiles_of(content: BundleContent) -> dict[tuple[int, int], BundleContent]:
-    """Return the tiles of a city by column and row. The cloud of each reaches beyond its square, as that of a built tile.
+    """Return the tiles of a city by column and row. The cloud of each has the same ground as that of a built tile.
 
     Args:
         content: the city.
@@ -166,26 +166,22 @@ def tiles_of(content: BundleContent) -> dict[tuple[int, int], BundleContent]:
     cloud = content.cloud
     if not isinstance(cloud, SurfelMap):
         raise TypeError(f"{content.name}: the city has no cloud; build it again")
-    surfels, cells = cloud.unpacked(slice(None)), np.floor(content.T_map_place[:, :2, 3] / TILE_M).astype(int)
-    xy = surfels["xyz"][:, :2] + cloud.origin_m[:2]
+    cells = np.floor(content.T_map_place[:, :2, 3] / TILE_M).astype(int)
+    squares = [(column, row) for column, row in np.unique(cells, axis=0).tolist()]
     tiles = {}
-    for column, row in np.unique(cells, axis=0).tolist():
-        low = TILE_M * np.array([column, row])
-        inside = ((xy >= low - TILE_MARGIN_M) & (xy < low + TILE_M + TILE_MARGIN_M)).all(axis=1)
-        brightness = None if cloud.brightness is None else cloud.brightness[inside].astype(np.float32)
-        part = of_places(content, (cells == (column, row)).all(axis=1))
-        tiles[column, row] = replace(part, cloud=SurfelMap.prepare(cloud.origin_m, surfels[inside], brightness))
+    for column, row in squares:
+        own = cloud_of_tile(cloud, TileArea(Square(column, row, TILE_M), set(squares)))
+        tiles[column, row] = replace(of_places(content, (cells == (column, row)).all(axis=1)), cloud=own)
     return tiles
 
 
-def _tiled(tiles: dict[tuple[int, int], BundleContent], shifts: list[NDArray[np.float64]], out: Path) -> Path:
-    """Write a tiled map with the tiles of a city at each shift, which is a multiple of the tile's edge."""
+def _tiled(city: BundleContent, shifts: list[NDArray[np.float64]], out: Path) -> Path:
+    """Write a tiled map with the city at each shift, which is a multiple of the tile's edge."""
     written = {}
     for shift in shifts:
-        for (column, row), content in tiles.items():
-            square = column + round(shift[0] / TILE_M), row + round(shift[1] / TILE_M)
-            written[square] = out.parent / f"{out.name}-{square[0]}-{square[1]}"
-            write_bundle(written[square], _moved(content, shift))
+        for (column, row), content in tiles_of(_moved(city, shift)).items():
+            written[column, row] = out.parent / f"{out.name}-{column}-{row}"
+            write_bundle(written[column, row], content)
     write_tiled(out, written, TILE_M, name="city")
     for each in written.values():
         shutil.rmtree(each)

@@ -36,7 +36,7 @@ from service.maps.rig_key import RigKey
 from service.option_limits import LEAST_HEIGHT_M, MOST_HEIGHT_M
 from service.registration.points import FOCAL_BASELINE_PX_M
 from service.registration.surfel_map import SurfelMap
-from service.registration.surfel_tiles import Cloud
+from service.registration.surfel_tiles import Cloud, Surfels
 from service.registration.visibility import DiscSettings, SurfelRaycaster
 from service.retrieval.query import Query
 
@@ -273,7 +273,7 @@ def _evidence(answer: Answer | None) -> NDArray[np.float64] | None:
 
 
 def _rendered(
-    cloud: SurfelMap, manifest: Manifest, T_map_place: Transform, rig: RigFile, number: int
+    cloud: Surfels, manifest: Manifest, T_map_place: Transform, rig: RigFile, number: int
 ) -> tuple[Query, Transform] | None:
     """Render the image of a camera near a place; return it with its T_map_camera, or None if no drawn pose sees enough."""
     rng = np.random.default_rng([31415, number])
@@ -296,7 +296,7 @@ def _drawn_pose(rig: RigFile, manifest: Manifest, rng: np.random.Generator) -> T
     return transform_from(rotation_z(heading) @ rotation_y(pitch) @ rotation_x(roll) @ R_BODY_OPTICAL, position)
 
 
-def render_query(cloud: SurfelMap, T_map_camera: Transform, rig: RigFile, rng: np.random.Generator) -> Query:
+def render_query(cloud: Surfels, T_map_camera: Transform, rig: RigFile, rng: np.random.Generator) -> Query:
     """Render the query that a rig would send from a pose.
 
     Rays of a small image choose the surfels. Each pixel then gets the depth of its ray on the plane of its surfel. Surfels are shifted
@@ -304,7 +304,7 @@ def render_query(cloud: SurfelMap, T_map_camera: Transform, rig: RigFile, rng: n
     the depth sensor come last.
 
     Args:
-        cloud: surfel map.
+        cloud: surfels around the pose.
         T_map_camera: pose of the camera, map frame.
         rig: the rig.
         rng: random generator of the objects and the errors.
@@ -315,9 +315,8 @@ def render_query(cloud: SurfelMap, T_map_camera: Transform, rig: RigFile, rng: n
     chosen, group[seen] = np.unique(index[seen], return_inverse=True)
     rays = camera.rays_of_pixels()
     z[seen] = _depth_on_surfels(cloud, chosen, group[seen], rays[seen], T_map_camera, rng)
-    intensity[seen] = (
-        1.0 if cloud.brightness is None else np.nan_to_num(cloud.brightness[chosen].astype(np.float32))[group[seen]]
-    )
+    brightness = cloud.brightness_of(chosen)
+    intensity[seen] = 1.0 if brightness is None else np.nan_to_num(brightness)[group[seen]]
     bright = float(np.median(intensity[intensity > 0])) if (intensity > 0).any() else 1.0
     for box in _new_objects(rig.camera.height_m, rng):
         hit = box.entered(rays)
@@ -327,11 +326,11 @@ def render_query(cloud: SurfelMap, T_map_camera: Transform, rig: RigFile, rng: n
     return Query(rgb=grey_image(intensity), depth_m=depth_m, camera=camera, baseline_m=rig.depth.baseline_m)
 
 
-def surfels_in_view(cloud: SurfelMap, T_map_camera: Transform, rig: RigFile) -> NDArray[np.int64]:
+def surfels_in_view(cloud: Surfels, T_map_camera: Transform, rig: RigFile) -> NDArray[np.int64]:
     """Return the index of the surfel that each pixel of a rig's image shows, -1 for none (H, W).
 
     Args:
-        cloud: surfel map.
+        cloud: surfels around the pose.
         T_map_camera: pose of the camera, map frame.
         rig: the rig.
     """
@@ -348,7 +347,7 @@ def surfels_in_view(cloud: SurfelMap, T_map_camera: Transform, rig: RigFile) -> 
 
 
 def _depth_on_surfels(
-    cloud: SurfelMap,
+    cloud: Surfels,
     chosen: NDArray[np.int64],
     group: NDArray[np.int64],
     rays: NDArray[np.float64],

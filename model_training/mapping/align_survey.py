@@ -162,7 +162,7 @@ def _registered(
     one = np.ones(len(points), np.float32)
     ray = (points.T / lengths(points)).T  # NumPy is slow for rows of three
     measured = QueryPoints(points, ray, np.float32(SIGMA_M) * one, one, 0 * one)
-    align(cloud.grid, cloud.surfels, measured, state, _SOLVER, tolerance_m=0.0)  # nobody reads the score
+    align(cloud.pieces, measured, state, _SOLVER, tolerance_m=0.0)  # nobody reads the score
     found = np.eye(4)
     found[:3, :3], found[:3, 3] = state["R"][0], state["t"][0] + cloud.origin_m
     return found

@@ -22,7 +22,7 @@ from model_training.mapping.settings import BuildSettings
 from model_training.mapping.site_check import HeldScan, held_out, site_of
 from model_training.mapping.stages import ResumedStages
 from model_training.mapping.survey import kept_scans, levelled_scans, require_poses_within
-from model_training.mapping.tiles import TILE_MARGIN_M
+from model_training.mapping.tile_area import OVERLAP_M
 from model_training.mapping.voxel_map import VoxelMap, lattice_origin
 from model_training.mapping.work import key_of, work_beside
 from service.errors import BundleError, DatasetError
@@ -127,7 +127,7 @@ def write_from(
     # 4. The bundle.
     trim()
     stages.report("writing", 0, 2)
-    content = with_cloud(content, cloud)
+    content = with_cloud(content, cloud, None if drive.part is None else drive.part.area)
     stages.report("writing", 1, 2)
     manifest = write_bundle(out, content, overwrite=overwrite)
     stages.report("writing", 2, 2)
@@ -194,7 +194,7 @@ def _content(drive: SurveyTraversal, places: Places, encoder_file: Path, lidar_h
             "survey_scans": float(len(drive.poses) if part is None else part.survey_scans),
             "between_m": settings.between_m,
             "places_between": float(places.between),
-            **({} if part is None else {"tile_margin_m": TILE_MARGIN_M}),
+            **({} if part is None else {"tile_overlap_m": OVERLAP_M}),
             **settings.survey_accuracy(dataset.description.survey_accuracy),
             **done,
         },

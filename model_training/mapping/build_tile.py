@@ -107,6 +107,7 @@ def key_of_tile(
     """
     made_of = (
         part.square,
+        part.area.beside,
         part.survey_scans,
         part.order.tolist(),
         part.travelled_m.tolist(),
@@ -152,7 +153,9 @@ def build_tile(task: TileTask, share: Share = lambda _: None) -> None:
         require_planned(task.name, found, task.key, inputs="other scans, another encoder")
         calibration = calibration_for(task.settings.calibration, encoder.sha256)
         at_scan = np.flatnonzero(task.part.plan.at_scan)
-        apart = set() if calibration is None else set(at_scan[sorted(held_out(len(at_scan)))].tolist())
+        # The check asks the tile alone, so it holds out places whose surroundings are all in its cloud.
+        inner = at_scan[task.part.area.surrounds(task.poses[at_scan][:, :2, 3])]
+        apart = set() if calibration is None else set(inner[sorted(held_out(len(inner)))].tolist())
         kept = np.arange(len(task.numbers))
         dataset.prepare()
         stages = ResumedStages(work, dataset, kept, task.settings, shares_of_stages(task.settings, share), task.part)

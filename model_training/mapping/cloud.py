@@ -1,6 +1,7 @@
 """Compute the cloud of a map: from the points of the scans to the content of a bundle."""
 
 from dataclasses import replace
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -37,30 +38,44 @@ def near(
     return transform_points(T_map_points, reached[:, :3].astype(np.float64)), reached[:, 3]
 
 
-def prepared(cloud: VoxelMap) -> SurfelMap | None:
+class Regions(Protocol):
+    """Chooses the regions of the lookup grid that a tile has (``tile_area.TileArea``)."""
+
+    def has_cells(self, centres: NDArray[np.float64]) -> NDArray[np.bool_]:
+        """Return whether the tile has the cells of each region (n,).
+
+        Args:
+            centres: centres of regions, metres, map frame (n, 3).
+        """
+
+
+def prepared(cloud: VoxelMap, regions: Regions | None = None) -> SurfelMap | None:
     """Prepare the cloud for registration; None if there is no surfel.
 
     Args:
         cloud: the voxel map.
+        regions: chooses the regions of a tile, whose grid then lies on the lattice of all tiles. None for a map of one bundle.
     """
     surfels, brightness = cloud.surfels()
     if not len(surfels):
         return None
-    packed = SurfelMap.packed(surfels, brightness)
+    packed = SurfelMap.packed(surfels, brightness, None if regions is None else -cloud.origin)
     del surfels, brightness  # a large map has no room for them beside the grid
-    found = SurfelMap.of_packed(cloud.origin, *packed)
+    has_cells = None if regions is None else lambda centres: regions.has_cells(centres + cloud.origin)
+    found = SurfelMap.of_packed(cloud.origin, *packed, has_cells)
     trim()  # the grid is made of many small blocks at first
     return found
 
 
-def with_cloud(content: BundleContent, cloud: VoxelMap) -> BundleContent:
+def with_cloud(content: BundleContent, cloud: VoxelMap, regions: Regions | None = None) -> BundleContent:
     """Return the map with a cloud, the voxel sums for merging, and the preview image. ``cloud`` must not change until it is written.
 
     Args:
         content: the map. Its own cloud, sums and preview are replaced.
         cloud: the voxel map of the cloud.
+        regions: as of ``prepared``.
     """
-    surfel_map = prepared(cloud)
+    surfel_map = prepared(cloud, regions)
     height_m = None if surfel_map is None else surveyed_height_m(surfel_map, content)
     others = {name: value for name, value in content.parameters.items() if name != SURVEYED_HEIGHT}
     return replace(

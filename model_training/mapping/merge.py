@@ -8,6 +8,7 @@ from model_training.mapping.build import tool_versions
 from model_training.mapping.cloud import with_cloud
 from model_training.mapping.join import joined, require_same
 from model_training.mapping.stored_map import content_of, empty_voxels_of, voxels_of
+from model_training.mapping.tile_area import TileArea
 from service.errors import BundleError
 from service.maps.manifest import Manifest
 from service.maps.reader import MapBundle
@@ -23,6 +24,7 @@ def merge_maps(
     out: Path,
     *,
     name: str | None = None,
+    area: TileArea | None = None,
     overwrite: bool = False,
     report: Report = lambda *_: None,
 ) -> Manifest:
@@ -37,6 +39,7 @@ def merge_maps(
         second: folder of another bundle.
         out: folder of the new bundle. It appears complete or not at all.
         name: name of the new map; None takes the name of the first.
+        area: the ground that the new bundle covers, if it is a tile. None for a map of one bundle.
         overwrite: replace an existing bundle at ``out``.
         report: called after every step.
 
@@ -56,7 +59,7 @@ def merge_maps(
     report("merge", 2, 4)
     cloud = voxels_of(a)
     cloud.add_statistics(voxels_of(b).statistics())
-    content = with_cloud(content, cloud)
+    content = with_cloud(content, cloud, area)
     report("merge", 3, 4)
     made = write_bundle(out, content, overwrite=overwrite)
     report("merge", 4, 4)

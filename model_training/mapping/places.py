@@ -156,7 +156,7 @@ class SurveyTraversal:
         positions, intensity = near(points, T_map_points)
         if self.part is None:
             return positions, intensity
-        inside = self.part.is_in_cloud(positions)
+        inside = self.part.area.is_in_cloud(positions)
         if inside.all():
             return positions, intensity
         return positions.compress(inside, axis=0), intensity[inside]

@@ -9,7 +9,7 @@ import numpy as np
 from model_training.mapping import engines
 from model_training.mapping.build import Report
 from model_training.mapping.build_tile import Share
-from model_training.mapping.tiles import Square
+from model_training.mapping.tile_area import Square
 from model_training.mapping.work import BuildCache, remove
 from model_training.tasks.engines import Engine
 from service.errors import BundleError

@@ -7,6 +7,7 @@ from typing import Any
 
 from model_training.mapping.diff import diff_of
 from model_training.mapping.merge import merge_maps
+from model_training.mapping.tile_area import Square, TileArea
 from service.errors import BundleError
 from service.maps.calibration import Calibration, read_calibration
 from service.maps.content import CALIBRATION_FILE
@@ -18,10 +19,10 @@ from service.maps.tiled_writer import write_tiled
 #: Progress callback: stage, finished steps, all steps.
 Report = Callable[[str, int, int], None]
 #: Column and row of a tile.
-Square = tuple[int, int]
+ColumnRow = tuple[int, int]
 
 
-def tiles_of(read: Manifest) -> dict[Square, Tile]:
+def tiles_of(read: Manifest) -> dict[ColumnRow, Tile]:
     """Return the tiles of a map by column and row.
 
     Args:
@@ -95,12 +96,16 @@ def merge_tiled(
     squares = sorted(one.keys() | two.keys())
     out.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(prefix=f".{out.name}.", suffix=".merging", dir=out.parent) as merging:
-        folders: dict[Square, Path] = {}
+        folders: dict[ColumnRow, Path] = {}
         for number, square in enumerate(squares, 1):
             if square in one and square in two and one[square].version != two[square].version:
                 folders[square] = Path(merging) / f"{square[0]}_{square[1]}"
                 merge_maps(
-                    first / one[square].folder, second / two[square].folder, folders[square], name=name or read.name
+                    first / one[square].folder,
+                    second / two[square].folder,
+                    folders[square],
+                    name=name or read.name,
+                    area=TileArea(Square(*square, read.tile_m or 0.0), set(squares)),
                 )
             else:
                 folders[square] = first / one[square].folder if square in one else second / two[square].folder

@@ -3,11 +3,7 @@
 The given poses decide, before anything is aligned. So each kept scan is in exactly one square, and the tiles do not depend on each
 other. A place between two scans is in the square of its interpolated position.
 
-A tile reads three nested areas:
-
-- Its square has its places.
-- The square plus ``TILE_MARGIN_M`` has its cloud.
-- The square plus ``SCANS_MARGIN_M`` has its scans. These are all scans that measure the cloud. So no surface of the cloud lacks a scan.
+A tile has the places of its square. It reads all scans that measure its cloud (``tile_area``). So no surface of the cloud lacks a scan.
 """
 
 import math
@@ -20,69 +16,36 @@ from numpy.typing import NDArray
 from model_training.mapping.between import PlannedPlaces
 from model_training.mapping.cloud import CLOUD_REACH_M
 from model_training.mapping.survey import travelled_m
+from model_training.mapping.tile_area import TILE_MARGIN_M, Square, TileArea
 from service.errors import DatasetError
 from service.maps.manifest import LARGEST_TILE_M, MOST_TILES, SMALLEST_TILE_M
 
-#: How far the cloud of a tile reaches beyond its square, metres. Depth and map views end at 40 m (``MAX_RANGE_M``), and the rendering of
-#: the map at a pose reads 45 m (``rendered_depth.REACH_M``). A camera stands up to some metres from the place that answers it.
-TILE_MARGIN_M = 50.0
-#: How far the scans of a tile lie beyond its square, metres. Farther scans have no point in the cloud.
+#: How far the scans of a tile lie beyond its square at most, metres. Farther scans have no point in the cloud.
 SCANS_MARGIN_M = TILE_MARGIN_M + CLOUD_REACH_M
-
-
-@dataclass(frozen=True, slots=True, order=True)
-class Square:
-    """A square of the ground.
-
-    Attributes:
-        column: it has the positions with ``column * tile_m <= x < (column + 1) * tile_m``, map frame, metres.
-        row: the same for y.
-        tile_m: edge, metres.
-    """
-
-    column: int
-    row: int
-    tile_m: float
-
-    def within(self, margin_m: float, positions: NDArray[np.float64]) -> NDArray[np.bool_]:
-        """Return whether each position is in the square or at most a margin beside it (n,).
-
-        Args:
-            margin_m: margin on all four sides, metres.
-            positions: metres, map frame (n, 2) or (n, 3).
-        """
-        inside = np.ones(len(positions), np.bool_)
-        for axis, number in enumerate((self.column, self.row)):
-            inside &= positions[:, axis] >= number * self.tile_m - margin_m
-            inside &= positions[:, axis] < (number + 1) * self.tile_m + margin_m
-        return inside
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TilePart:
-    """The part of a survey that becomes a tile. Its K scans are all kept scans within ``SCANS_MARGIN_M`` of the square.
+    """The part of a survey that becomes a tile. Its K scans are all kept scans with points in the cloud.
 
     Attributes:
-        square: the square of the tile.
+        area: the ground that the tile covers.
         plan: places of the tile, by the index of the scan in the part.
         order: index of each scan among all kept scans (K,).
         travelled_m: travelled distance from the first kept scan of the survey to each scan, metres (K,).
         survey_scans: number of scans of the survey in the square, kept or not.
     """
 
-    square: Square
+    area: TileArea
     plan: PlannedPlaces
     order: NDArray[np.int64]
     travelled_m: NDArray[np.float64]
     survey_scans: int
 
-    def is_in_cloud(self, positions: NDArray[np.float64]) -> NDArray[np.bool_]:
-        """Return whether the cloud of the tile has each point (n,).
-
-        Args:
-            positions: metres, map frame (n, 3).
-        """
-        return self.square.within(TILE_MARGIN_M, positions)
+    @property
+    def square(self) -> Square:
+        """The square of the tile."""
+        return self.area.square
 
 
 def require_tile_edge(tile_m: float) -> None:
@@ -140,7 +103,7 @@ def tile_parts(
         kept: indices of the kept scans, ascending (P,).
         tile_m: edge of the tiles, metres.
         between_m: largest distance between two places, metres; 0 puts none between scans.
-        also: columns and rows of squares to yield without a place too. Their parts may have no scan.
+        also: columns and rows of other squares that have a tile. They are yielded without a place too, and their parts may have no scan.
 
     Raises:
         DatasetError: a pose is too far from the origin of the map frame.
@@ -155,16 +118,17 @@ def tile_parts(
     given_in = {square: len(found) for square, found in _grouped(columns_and_rows(poses[:, :3, 3], tile_m)).items()}
     around = range(-math.ceil(SCANS_MARGIN_M / tile_m), math.ceil(SCANS_MARGIN_M / tile_m) + 1)
     none = np.zeros(0, np.int64)
-    for column, row in sorted(scans_in.keys() | ways_in.keys() | set(also)):
-        square = Square(column, row, tile_m)
+    squares = scans_in.keys() | ways_in.keys() | set(also)
+    for column, row in sorted(squares):
+        area = TileArea(Square(column, row, tile_m), squares)
         near = np.sort(np.concatenate([scans_in.get((column + x, row + y), none) for x in around for y in around]))
-        order = near[square.within(SCANS_MARGIN_M, xy[near])]
+        order = near[area.reads(xy[near])]
         on_way: dict[int, tuple[float, ...]] = {}
         for way in ways_in.get((column, row), none):
             k = int(np.searchsorted(order, later[way]))
             on_way[k] = (*on_way.get(k, ()), float(share[way]))
         at_scan = (of_scan[order] == (column, row)).all(axis=1)
-        yield TilePart(square, PlannedPlaces(at_scan, on_way), order, travelled[order], given_in.get((column, row), 0))
+        yield TilePart(area, PlannedPlaces(at_scan, on_way), order, travelled[order], given_in.get((column, row), 0))
 
 
 def places_xy(T_map_lidar: NDArray[np.float64], between_m: float) -> NDArray[np.float64]:

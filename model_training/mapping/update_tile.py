@@ -87,7 +87,7 @@ class TileUpdate:
             BundleError: the manifest of the tile cannot be read.
         """
         part = self.part
-        planned = (part.square, part.survey_scans, part.order.tolist(), part.travelled_m.tolist())
+        planned = (part.square, part.area.beside, part.survey_scans, part.order.tolist(), part.travelled_m.tolist())
         places = (part.plan.at_scan.tolist(), sorted(part.plan.on_way.items()))
         return key_of(
             self.survey(),
@@ -176,7 +176,10 @@ def update_tile(task: UpdateTask, share: Share = lambda _: None) -> None:
         else:
             content = _without_polygon(update, content, cloud)
         if len(content.T_map_place):
-            write_bundle(task.folder, with_cloud(replace(content, tool_versions=tool_versions()), cloud))
+            area = update.part.area
+            cloud.keep(area.is_in_cloud(cloud.means()))  # a new tile beside this one has the rest
+            content = with_cloud(replace(content, tool_versions=tool_versions()), cloud, area)
+            write_bundle(task.folder, content)
         else:
             task.no_place_left.touch()
 
@@ -230,7 +233,7 @@ def _in_margin(tiles: tuple[Path, ...], part: TilePart, empty: VoxelMap) -> Voxe
     for path in tiles:
         other = VoxelMap(empty.voxel_m, empty.origin)
         other.add_statistics(voxels_of(MapBundle.open(path)).statistics())
-        inside = part.is_in_cloud(other.means())
+        inside = part.area.is_in_cloud(other.means())
         keys.append(other.sums()[0][inside])
         moments.append(other.sums()[1][inside])
     of_all, sums = np.concatenate(keys), np.concatenate(moments)

@@ -14,9 +14,10 @@ from model_training.mapping.settings import BuildSettings
 from model_training.mapping.stages import ResumedStages
 from model_training.mapping.stored_map import streets_of_bundle
 from model_training.mapping.survey import kept_scans
+from model_training.mapping.tile_area import TILE_MARGIN_M
 from model_training.mapping.tile_tasks import finish_tiles, folder_of, is_of_tile
-from model_training.mapping.tiled_care import Square, tiles_of
-from model_training.mapping.tiles import TILE_MARGIN_M, TilePart, places_xy, tile_parts
+from model_training.mapping.tiled_care import ColumnRow, tiles_of
+from model_training.mapping.tiles import TilePart, places_xy, tile_parts
 from model_training.mapping.update import Replacement, in_frame_of, require_rows
 from model_training.mapping.update_tile import TileUpdate, UpdateTask, memory_of, update_tile
 from model_training.mapping.work import key_of, work_beside
@@ -154,13 +155,13 @@ def _require_common(whole: TiledMap) -> None:
             )
 
 
-def _touch(square: Square, part: TilePart) -> bool:
+def _touch(square: ColumnRow, part: TilePart) -> bool:
     """Return whether the cloud of a square's tile reaches into that of another tile."""
     away = max(abs(square[0] - part.square.column), abs(square[1] - part.square.row)) - 1
     return away * part.square.tile_m < 2 * TILE_MARGIN_M
 
 
-def _square(part: TilePart) -> Square:
+def _square(part: TilePart) -> ColumnRow:
     return part.square.column, part.square.row
 
 

@@ -17,7 +17,7 @@ from service.localization.refine import RefineSettings
 from service.maps.map import Map
 from service.registration.kernel import render
 from service.registration.register import Registered
-from service.registration.surfel_map import SurfelMap
+from service.registration.surfel_tiles import Surfels
 from service.retrieval.query import Query
 from service.retrieval.retrieve import EncodedFrame
 from service.runtime.engine import EncodedQuery, Engine, Located
@@ -113,7 +113,7 @@ def _fused(frame: EncodedFrame, grid: ViewGrid) -> NDArray[np.uint8]:
 
 
 def _map_view(
-    bundle: Map, cloud: SurfelMap, position_m: Float64[NDArray[np.float64], "3"], heading_rad: float
+    bundle: Map, cloud: Surfels, position_m: Float64[NDArray[np.float64], "3"], heading_rad: float
 ) -> NDArray[np.uint8]:
     """Return an image of the map on the view grid, rendered from the cloud at a position and heading."""
     T_map_camera = transform_from(rotation_z(heading_rad) @ R_BODY_OPTICAL, position_m)
@@ -141,9 +141,9 @@ def camera_over(grid: ViewGrid) -> PinholeCamera:
     return PinholeCamera(width, height, focal, focal, (width - 1) / 2, (height - 1) / 2)
 
 
-def _drawn_map(cloud: SurfelMap, T_map_camera: Transform, camera: PinholeCamera) -> Float32[NDArray[np.float32], "H W"]:
+def _drawn_map(cloud: Surfels, T_map_camera: Transform, camera: PinholeCamera) -> Float32[NDArray[np.float32], "H W"]:
     T = transform_from(T_map_camera[:3, :3], T_map_camera[:3, 3] - cloud.origin_m)
-    return render(cloud.grid, cloud.surfels, T_map_camera=T, camera=camera, size_m=SURFEL_M, reach_m=REACH_M)
+    return render(cloud.pieces, T_map_camera=T, camera=camera, size_m=SURFEL_M, reach_m=REACH_M)
 
 
 def _scaled(query: Query) -> PinholeCamera:

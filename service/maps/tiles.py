@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
-from jaxtyping import Bool, Float32, Float64, Int32, Int64
+from jaxtyping import Bool, Float32, Float64, Int8, Int32, Int64
 from numpy.typing import NDArray
 
 from service.errors import BundleError, damaged_file
@@ -31,8 +31,16 @@ from service.maps.manifest import FileEntry, Manifest, Tile, read_manifest
 from service.maps.map import Map
 from service.maps.reader import MapBundle, read_streets
 from service.maps.streets import Streets, StreetsFile
-from service.registration.surfel_map import SurfelMap
-from service.registration.surfel_tiles import SurfelTiles
+from service.registration.surfel_map import REGION_M, SurfelMap
+from service.registration.surfel_tiles import (
+    AROUND_M,
+    JoinedSurfels,
+    Surfels,
+    SurfelTiles,
+    columns_of_regions,
+    lies_on_lattice,
+    numbers_in_map,
+)
 
 #: Largest number of tiles that are searched for one query. A map of more tiles needs a search index, which chooses them.
 MOST_SEARCHED = 6
@@ -52,6 +60,8 @@ LEAST_STEP_M = 0.05
 PREPARE_EVERY_S = 10.0
 #: Largest number of regions that are kept, each put together from several tiles.
 MOST_REGIONS = 16
+#: Largest number of joined clouds that are kept. Each takes 64 bytes for each region of its tiles.
+MOST_JOINED = 64
 _NEEDED = (parts.ENCODER_FILE, parts.PLACES_FILE, parts.CALIBRATION_FILE)
 
 
@@ -198,6 +208,7 @@ class OpenTiles:
         self._prepared_s: dict[int, float] = {}
         self._opened: OrderedDict[int, MapBundle] = OrderedDict()
         self._regions: dict[tuple[int, ...], Map] = {}
+        self._joined: OrderedDict[tuple[int, ...], JoinedSurfels] = OrderedDict()
         self._changing = threading.Lock()
         self._opening: defaultdict[int, threading.Lock] = defaultdict(threading.Lock)
         corners = np.array(
@@ -327,22 +338,90 @@ class OpenTiles:
         """
         if not self._manifest.counts.cloud_points:
             return None
-        squares_m = self.squares_m[list(numbers)]
+        among = np.array(numbers, np.int64)
+        squares_m = self.squares_m[among]
         middle_m = np.array([*(squares_m[:, :2] + squares_m[:, 2:]).mean(axis=0) / 2, 0.0])
-
-        def cloud_of(row: int) -> SurfelMap:
-            cloud = (self.get(numbers[row]) if opened is None else opened[row]).cloud
-            if not isinstance(cloud, SurfelMap):
-                raise damaged_file(self._path / self._manifest.tiles[numbers[row]].folder, "the tile has no cloud")
-            return cloud
-
         has_brightness = opened is not None and all(
             each.cloud is not None and each.cloud.has_brightness for each in opened
         )
         drawn = range(len(numbers)) if opened is not None or isinstance(self._source, LocalTiles) else None
         return SurfelTiles(
-            squares_m, cloud_of, middle_m, has_brightness, lambda: self.opened if drawn is None else drawn
+            lambda xy_m: self.near(xy_m, among),
+            self.surfels_of,
+            middle_m,
+            has_brightness,
+            lambda: self.opened if drawn is None else [numbers[row] for row in drawn],
         )
+
+    def near(
+        self, xy_m: Float64[NDArray[np.float64], "n 2"], among: Int64[NDArray[np.int64], " m"]
+    ) -> list[tuple[int, ...]]:
+        """Return the tiles whose surfels a camera may see from each position, by their numbers.
+
+        The tile at the position comes first. If it is not among the given ones, the nearest of these comes first. The others follow in the
+        order of the map.
+
+        Args:
+            xy_m: positions, map frame, m.
+            among: numbers of the tiles that a query uses.
+        """
+        first = among[nearest_square(self.squares_m[among], xy_m)]
+        of_low, of_high = (
+            columns_of_regions(np.floor((xy_m + side) / REGION_M).astype(np.int64), self._tile_m)
+            for side in (-AROUND_M, AROUND_M)
+        )
+        found: dict[tuple[int, ...], tuple[int, ...]] = {}
+        keys = [tuple(row) for row in np.column_stack([first, of_low, of_high]).tolist()]
+        for key in dict.fromkeys(keys):
+            own, x0, y0, x1, y1 = key
+            around = (self._number.get((x, y)) for x in range(x0, x1 + 1) for y in range(y0, y1 + 1))
+            found[key] = (own, *(number for number in around if number is not None and number != own))
+        return [found[key] for key in keys]
+
+    def surfels_of(self, numbers: tuple[int, ...]) -> Surfels:
+        """Return the surfels of some tiles together. They are kept as long as all of these tiles are open.
+
+        Args:
+            numbers: numbers of the tiles, the one that gives the frame first.
+
+        Raises:
+            BundleError: as ``get``.
+        """
+        if len(numbers) == 1:
+            return self._cloud_of(numbers[0], self.get(numbers[0]))
+        with self._changing:
+            if (known := self._joined.get(numbers)) is not None:
+                self._joined.move_to_end(numbers)
+                for number in numbers:
+                    self._opened.move_to_end(number)
+                    self._source.used(self._manifest.tiles[number])
+                return known
+        opened = dict(zip(numbers, self.get_all(numbers), strict=True))
+        self._cloud_of(numbers[0], opened[numbers[0]])
+        clouds = {number: bundle.cloud for number, bundle in opened.items() if isinstance(bundle.cloud, SurfelMap)}
+        made = JoinedSurfels.of(list(clouds.values()), [self._ranks(*each) for each in clouds.items()])
+        with self._changing:
+            if all(number in self._opened for number in numbers):
+                self._joined[numbers] = made
+                while len(self._joined) > MOST_JOINED:
+                    self._joined.popitem(last=False)
+        return made
+
+    def _cloud_of(self, number: int, bundle: MapBundle) -> SurfelMap:
+        if not isinstance(bundle.cloud, SurfelMap):
+            raise damaged_file(self._path / self._manifest.tiles[number].folder, "the tile has no cloud")
+        return bundle.cloud
+
+    def _ranks(self, number: int, cloud: SurfelMap) -> Int8[NDArray[np.int8], " R"]:
+        """Return which regions a tile gives to the map: 2 for its own, 1 for those that it has and does not own, 0 for those without cells.
+
+        A tile has regions of squares without a tile. A merged map may have tiles there.
+        """
+        tile, grid = self._manifest.tiles[number], cloud.grid
+        owners = columns_of_regions(numbers_in_map(cloud)[:, :2], self._tile_m)
+        is_own = (owners == (tile.column, tile.row)).all(axis=1)
+        has_cells = np.diff(grid.regions["block"], append=len(grid.blocks)) > 0
+        return np.where(is_own, np.int8(2), has_cells.astype(np.int8))
 
     def _prepare(self, number: int) -> None:
         """Fetch and check a tile, and open it if there is room."""
@@ -390,6 +469,8 @@ class OpenTiles:
         while len(self._opened) > 1 and self._open_bytes() > self._limit:
             closed, _ = self._opened.popitem(last=False)
             self._regions = {key: region for key, region in self._regions.items() if closed not in key}
+            for key in [key for key in self._joined if closed in key]:
+                del self._joined[key]
 
     def _open(self, tile: Tile, *, ahead: bool = False) -> MapBundle:
         """Open a tile. A request may do so, and its answer names no folder of the machine and no address."""
@@ -427,6 +508,9 @@ class OpenTiles:
             raise damaged_file(folder / manifest.FILE, f"{different[0]} differs from the map")
         if bundle.manifest.counts != tile.counts:
             raise damaged_file(folder / manifest.FILE, "the counts are not those that the map lists")
+        if len(self) > 1 and isinstance(bundle.cloud, SurfelMap) and not lies_on_lattice(bundle.cloud):
+            what = "the grid does not fit to those of other tiles, as in a map of an earlier release"
+            raise damaged_file(folder / parts.CLOUD_FOLDER / "grid_frame.npy", what)
         try:
             places = places_in_map(bundle, self._street_number, self._manifest.lidar_height_m)
         except KeyError as error:
@@ -556,6 +640,9 @@ class TiledMap(Map):
             raise BundleError(
                 f"{path}: a map of one bundle, not a tiled map; open it with open_map", field=manifest.FILE
             )
+        if "tile_margin_m" in read.parameters:
+            what = "its tiles overlap as in an earlier release; build the map again with this release"
+            raise BundleError(f"{path}: {what}", field=manifest.FILE)
         require_files(path, read, _NEEDED, verify=verify)
         named = read_streets(path, read)
         tiles = OpenTiles(path, read, named, source or LocalTiles(path), verify=verify, open_bytes=open_bytes)
@@ -748,6 +835,21 @@ def in_order(numbers: Int64[NDArray[np.int64], " n"]) -> Int64[NDArray[np.int64]
     """
     _, first = np.unique(numbers, return_index=True)
     return numbers[np.sort(first)]
+
+
+def nearest_square(
+    squares_m: Float64[NDArray[np.float64], "T 4"], xy_m: Float64[NDArray[np.float64], "n 2"]
+) -> Int64[NDArray[np.int64], " n"]:
+    """Return the row of the square that holds each position, or of the nearest square.
+
+    Args:
+        squares_m: x0, y0, x1, y1 of each square, m.
+        xy_m: positions, m.
+    """
+    low, high = squares_m[None, :, :2] - xy_m[:, None], xy_m[:, None] - squares_m[None, :, 2:]
+    away = np.linalg.norm(np.maximum(np.maximum(low, high), 0.0), axis=2)
+    nearest: Int64[NDArray[np.int64], " n"] = away.argmin(axis=1)
+    return nearest
 
 
 def _away_m(

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from service.geometry.rigid import rotation_z
 from service.registration.kernel import STATE, UNKNOWNS, QueryPoints, gradients
 from service.registration.register import Registered, RegistrationSettings
-from service.registration.surfel_map import SurfelMap
+from service.registration.surfel_tiles import Surfels
 
 #: Reference noise of the models: standard deviation of an inverse depth of a precise camera, 1/m.
 AT_NOISE = 0.00095
@@ -205,7 +205,7 @@ def _misfit_scale(model: CovarianceModel, inflation: float, stability: Stability
 
 
 def score_outer_product(
-    cloud: SurfelMap, points: QueryPoints, found: Registered, settings: RegistrationSettings
+    cloud: Surfels, points: QueryPoints, found: Registered, settings: RegistrationSettings
 ) -> Float64[NDArray[np.float64], "8 8"]:
     """Sum the outer products of the patches' gradients at a registered pose, scaled up for few patches.
 
@@ -213,7 +213,7 @@ def score_outer_product(
     would be the information. The factor for few patches is n / (n - 8).
 
     Args:
-        cloud: surfel map.
+        cloud: surfels around the pose.
         points: the registered points of the query, in its level frame.
         found: the registered pose, map frame.
         settings: the settings that registered it.
@@ -225,7 +225,7 @@ def score_outer_product(
     state["R"], state["t"] = found.R_map_level, found.camera_m - cloud.origin_m
     state["log_scale"], state["offset"] = np.log(found.scale), found.offset
     weighed = points.with_least_weight(settings.fine_weight)
-    each = gradients(cloud.grid, cloud.surfels, weighed, state, settings.fine, patches(points.ray))
+    each = gradients(cloud.pieces, weighed, state, settings.fine, patches(points.ray))
     scatter: Float64[NDArray[np.float64], "8 8"] = each.T @ each * (len(each) / max(len(each) - UNKNOWNS, 1))
     return scatter
 

@@ -37,15 +37,26 @@ typedef struct {
     uint16_t row[REGION_BLOCKS]; /* row of each block, counted from ``block``, plus 1; 0 for none */
 } Region;
 
+/* Surfels with their regions: a map of one bundle, or what a tile has of a tiled map. */
 typedef struct {
-    double ox, oy, oz, cell; /* corner of the grid and edge of a cell, m */
-    int64_t slot_bits;       /* binary logarithm of the number of slots */
-    const int32_t *slots;    /* hash table with linear probing: row of a region in regions, -1 for none */
+    int64_t slot_bits;    /* binary logarithm of the number of slots */
+    const int32_t *slots; /* hash table with linear probing: row of a region in regions, -1 for none */
     const Region *regions;
     const Block *blocks;
-    const void *nearest;   /* of each filled cell: number of the surfel nearest to its centre (uint16_t or uint32_t) */
-    int64_t nearest_bytes; /* size of such a number: 2 or 4 */
-    const int32_t *others; /* rows in surfels */
+    const void *nearest;         /* of each filled cell: number of the surfel nearest to its centre (uint16_t or uint32_t) */
+    int64_t nearest_bytes;       /* size of such a number: 2 or 4 */
+    const int32_t *others;       /* rows in surfels */
+    const PackedSurfel *surfels;
+    const uint8_t *served;       /* 1 for a region that this piece gives to the grid; 0: it gives all */
+    int64_t shift[3];            /* regions along x, y, z from the corner of the grid to that of this piece */
+    int64_t first;               /* number of its first surfel among those of all pieces */
+} Piece;
+
+/* The regions of all pieces together. Each region comes from one piece. */
+typedef struct {
+    double ox, oy, oz, cell; /* corner of the grid and edge of a cell, m */
+    int64_t count;           /* number of pieces */
+    const Piece *pieces;
 } Grid;
 
 /* Each array is padded with zeros to whole batches (BATCH_SIZE). */
@@ -145,6 +156,7 @@ typedef struct {
 typedef struct {
     int64_t key[RECENT * RECENT * RECENT];
     const Region *region[RECENT * RECENT * RECENT]; /* EMPTY_REGION if the grid has no such region */
+    const Piece *piece[RECENT * RECENT * RECENT];   /* the piece that has it */
 } Recent;
 
 static inline void forget(Recent *recent)
@@ -161,35 +173,55 @@ static inline int64_t first_slot(int64_t key, int64_t slot_bits)
 static const Region EMPTY_REGION;
 static const Block EMPTY_BLOCK;
 
-static inline const Region *find_region(const Grid *g, int64_t key)
-{
-    const int64_t last = ((int64_t)1 << g->slot_bits) - 1;
-    int64_t slot = first_slot(key, g->slot_bits);
-    for (int64_t tried = 0; tried <= last; tried++) {
-        const int32_t row = g->slots[slot];
-        if (row < 0) return &EMPTY_REGION;
-        if (g->regions[row].key == key) return g->regions + row;
-        slot = (slot + 1) & last;
-    }
-    return &EMPTY_REGION;
-}
-
 static inline int64_t key_of(int64_t x, int64_t y, int64_t z)
 {
     return (x << 2 * KEY_BITS) + (y << KEY_BITS) + z;
 }
 
-/* Row of the surfel that an entry of ``nearest`` refers to. */
-static inline int64_t row_of(const Grid *g, const Region *region, int64_t entry)
+/* Finds the region x, y, z of a piece; EMPTY_REGION if the piece does not give it to the grid. */
+static inline const Region *region_of(const Piece *piece, int64_t x, int64_t y, int64_t z)
 {
-    const int64_t number = g->nearest_bytes == 2 ? ((const uint16_t *)g->nearest)[entry] : ((const uint32_t *)g->nearest)[entry];
-    return number < region->surfels ? region->surfel + number : g->others[region->other + number - region->surfels];
+    const int64_t own[3] = {x - piece->shift[0], y - piece->shift[1], z - piece->shift[2]};
+    if (own[0] < 0 || own[1] < 0 || own[2] < 0) return &EMPTY_REGION;
+    const int64_t key = key_of(own[0], own[1], own[2]), last = ((int64_t)1 << piece->slot_bits) - 1;
+    int64_t slot = first_slot(key, piece->slot_bits);
+    for (int64_t tried = 0; tried <= last; tried++) {
+        const int32_t row = piece->slots[slot];
+        if (row < 0) return &EMPTY_REGION;
+        if (piece->regions[row].key == key) return piece->served && !piece->served[row] ? &EMPTY_REGION : piece->regions + row;
+        slot = (slot + 1) & last;
+    }
+    return &EMPTY_REGION;
 }
 
-/* Finds the surfels that the cells at some positions refer to: ``at`` (3, BATCH_SIZE), surfels' frame, m. Writes their rows, -1 for a cell
- * that is not filled, and the positions in their regions, steps. */
+/* Enters the region of a key in the recent ones. */
+static inline void find_region(const Grid *g, int64_t key, int32_t entry, Recent *recent)
+{
+    const int64_t mask = ((int64_t)1 << KEY_BITS) - 1;
+    recent->key[entry] = key;
+    recent->region[entry] = &EMPTY_REGION;
+    recent->piece[entry] = g->pieces;
+    for (const Piece *piece = g->pieces; piece < g->pieces + g->count; piece++) {
+        const Region *region = region_of(piece, key >> 2 * KEY_BITS, key >> KEY_BITS & mask, key & mask);
+        if (region == &EMPTY_REGION) continue;
+        recent->region[entry] = region;
+        recent->piece[entry] = piece;
+        return;
+    }
+}
+
+/* Row of the surfel that an entry of ``nearest`` refers to. */
+static inline int64_t row_of(const Piece *piece, const Region *region, int64_t entry)
+{
+    const int64_t number =
+        piece->nearest_bytes == 2 ? ((const uint16_t *)piece->nearest)[entry] : ((const uint32_t *)piece->nearest)[entry];
+    return number < region->surfels ? region->surfel + number : piece->others[region->other + number - region->surfels];
+}
+
+/* Finds the surfels that the cells at some positions refer to: ``at`` (3, BATCH_SIZE), surfels' frame, m. Writes their pieces
+ * and their rows there, -1 for a cell that is not filled, and the positions in their regions, steps. */
 static inline void find_cells(const Grid *g, double at[3][BATCH_SIZE], int64_t count, Recent *recent, float local[3][BATCH_SIZE],
-                              int64_t *rows)
+                              const Piece **pieces, int64_t *rows)
 {
     int32_t in[3][BATCH_SIZE], recent_entry[BATCH_SIZE], number[BATCH_SIZE], part[BATCH_SIZE], bit[BATCH_SIZE];
     int64_t keys[BATCH_SIZE];
@@ -221,25 +253,23 @@ static inline void find_cells(const Grid *g, double at[3][BATCH_SIZE], int64_t c
      * and entries are fetched ahead. */
     for (int64_t k = 0; k < count; k++) {
         const int32_t entry = recent_entry[k];
-        if (recent->key[entry] != keys[k]) {
-            recent->region[entry] = find_region(g, keys[k]);
-            recent->key[entry] = keys[k];
-        }
+        if (recent->key[entry] != keys[k]) find_region(g, keys[k], entry, recent);
         regions[k] = recent->region[entry];
+        pieces[k] = recent->piece[entry];
     }
     for (int64_t k = 0; k < count; k++) {
         const int64_t row = regions[k]->row[number[k]];
-        blocks[k] = row ? g->blocks + regions[k]->block + row - 1 : &EMPTY_BLOCK;
+        blocks[k] = row ? pieces[k]->blocks + regions[k]->block + row - 1 : &EMPTY_BLOCK;
         __builtin_prefetch(blocks[k]->filled + part[k]);
         __builtin_prefetch(&blocks[k]->first);
     }
     for (int64_t k = 0; k < count; k++) {
         const uint64_t filled = blocks[k]->filled[part[k]], cell = (uint64_t)1 << bit[k];
         const int64_t entry = blocks[k]->first + blocks[k]->before[part[k]] + __builtin_popcountll(filled & (cell - 1));
-        __builtin_prefetch((const char *)g->nearest + entry * g->nearest_bytes);
+        __builtin_prefetch((const char *)pieces[k]->nearest + entry * pieces[k]->nearest_bytes);
         cells[k] = filled & cell ? entry : -1;
     }
-    for (int64_t k = 0; k < count; k++) rows[k] = cells[k] < 0 ? -1 : row_of(g, regions[k], cells[k]);
+    for (int64_t k = 0; k < count; k++) rows[k] = cells[k] < 0 ? -1 : row_of(pieces[k], regions[k], cells[k]);
 }
 
 /* Unpacks the surfels of a batch. The steps give the position modulo one region. A surfel of another region is less than half a region
@@ -271,10 +301,11 @@ static inline void unpack(Batch *b, double cell)
 }
 
 /* Positions of the points first .. first + count - 1 in the surfels' frame, and their nearest surfels. */
-static inline void find_surfels(const Grid *g, const PackedSurfel *surfels, const Query *q, const State *s, double e_scale, int64_t first,
-                                int64_t count, Recent *recent, Batch *b)
+static inline void find_surfels(const Grid *g, const Query *q, const State *s, double e_scale, int64_t first, int64_t count, Recent *recent,
+                                Batch *b)
 {
     int64_t rows[BATCH_SIZE];
+    const Piece *pieces[BATCH_SIZE];
     for (int k = 0; k < BATCH_SIZE; k++) b->stretch[k] = e_scale / (1.0 + s->offset * q->q[first + k]);
     for (int k = 0; k < BATCH_SIZE; k++) {
         const double px = b->stretch[k] * q->xyz[0][first + k], py = b->stretch[k] * q->xyz[1][first + k];
@@ -284,9 +315,9 @@ static inline void find_surfels(const Grid *g, const PackedSurfel *surfels, cons
             b->at[a][k] = b->y[a][k] + s->t[a];
         }
     }
-    find_cells(g, b->at, count, recent, b->local, rows);
+    find_cells(g, b->at, count, recent, b->local, pieces, rows);
     for (int64_t k = 0; k < count; k++) {
-        b->surfel[k] = rows[k] < 0 ? 0 : surfels + rows[k];
+        b->surfel[k] = rows[k] < 0 ? 0 : pieces[k]->surfels + rows[k];
         if (b->surfel[k]) __builtin_prefetch(b->surfel[k]);
     }
     for (int64_t k = count; k < BATCH_SIZE; k++) b->surfel[k] = 0;
@@ -377,7 +408,7 @@ static inline void add_products(const double *one, const double *other, double *
     for (int l = 0; l < LANES; l++) sums[l] += own[l];
 }
 
-static inline void align_one(const Grid *g, const PackedSurfel *surfels, const Query *q, const Options *o, Recent *recent, State *s)
+static inline void align_one(const Grid *g, const Query *q, const Options *o, Recent *recent, State *s)
 {
     Batch batch;
     double total_weight = 0;
@@ -389,7 +420,7 @@ static inline void align_one(const Grid *g, const PackedSurfel *surfels, const Q
         double sums[UNKNOWNS][UNKNOWNS + 1][LANES] = {{{0}}}, e_scale = exp(s->log_scale), total = 0, squares = 0;
         for (int64_t first = 0; first < q->count; first += BATCH_SIZE) {
             const int64_t left = q->count - first, count = left < BATCH_SIZE ? left : BATCH_SIZE;
-            find_surfels(g, surfels, q, s, e_scale, first, count, recent, &batch);
+            find_surfels(g, q, s, e_scale, first, count, recent, &batch);
             linearise(q, o, s, robust, e_scale, first, &batch);
             for (int a = 0; a < UNKNOWNS; a++) {
                 double weighted[BATCH_SIZE];
@@ -428,14 +459,13 @@ static inline void align_one(const Grid *g, const PackedSurfel *surfels, const Q
 
 /* Share of the points on the map. Precise points weigh more. A point counts by exp(-r^2 / (2 variance)) of its distance r to the surface,
  * not by a hard threshold. */
-static inline void score_one(const Grid *g, const PackedSurfel *surfels, const Query *q, double tolerance, double height_min,
-                             Recent *recent, State *s)
+static inline void score_one(const Grid *g, const Query *q, double tolerance, double height_min, Recent *recent, State *s)
 {
     Batch batch;
     double inliers = 0, total = 0, e_scale = exp(s->log_scale);
     for (int64_t first = 0; first < q->count; first += BATCH_SIZE) {
         const int64_t left = q->count - first, count = left < BATCH_SIZE ? left : BATCH_SIZE;
-        find_surfels(g, surfels, q, s, e_scale, first, count, recent, &batch);
+        find_surfels(g, q, s, e_scale, first, count, recent, &batch);
         for (int64_t k = 0; k < count; k++) {
             const int64_t i = first + k;
             double sigma = q->sigma[i];
@@ -457,20 +487,19 @@ static inline void score_one(const Grid *g, const PackedSurfel *surfels, const Q
 }
 
 /* tolerance: 0: the results are not scored. */
-WIDE void streetfix_align(const Grid *g, const PackedSurfel *surfels, const Query *q, const Options *o, double tolerance, double height_min,
-                          int64_t count, State *states)
+WIDE void streetfix_align(const Grid *g, const Query *q, const Options *o, double tolerance, double height_min, int64_t count,
+                          State *states)
 {
     Recent recent;
     forget(&recent);
     for (int64_t k = 0; k < count; k++) {
-        if (o->iterations > 0) align_one(g, surfels, q, o, &recent, states + k);
-        if (tolerance > 0) score_one(g, surfels, q, tolerance, height_min, &recent, states + k);
+        if (o->iterations > 0) align_one(g, q, o, &recent, states + k);
+        if (tolerance > 0) score_one(g, q, tolerance, height_min, &recent, states + k);
     }
 }
 
 /* Adds weight x residual x gradient of all points of each patch to ``gradients`` (patches, 8), which the caller sets to 0. */
-void streetfix_gradients(const Grid *g, const PackedSurfel *surfels, const Query *q, const Options *o, const State *s, const int32_t *patch,
-                         double *gradients)
+void streetfix_gradients(const Grid *g, const Query *q, const Options *o, const State *s, const int32_t *patch, double *gradients)
 {
     Batch batch;
     Recent recent;
@@ -478,14 +507,14 @@ void streetfix_gradients(const Grid *g, const PackedSurfel *surfels, const Query
     const double e_scale = exp(s->log_scale);
     for (int64_t first = 0; first < q->count; first += BATCH_SIZE) {
         const int64_t left = q->count - first, count = left < BATCH_SIZE ? left : BATCH_SIZE;
-        find_surfels(g, surfels, q, s, e_scale, first, count, &recent, &batch);
+        find_surfels(g, q, s, e_scale, first, count, &recent, &batch);
         linearise(q, o, s, o->robust_last, e_scale, first, &batch);
         for (int64_t k = 0; k < count; k++)
             for (int a = 0; a < UNKNOWNS; a++) gradients[UNKNOWNS * patch[first + k] + a] += batch.w[k] * batch.r[k] * batch.gradient[a][k];
     }
 }
 
-/* Writes to ``found`` the row of the surfel that the grid holds for each position (count, 3), surfels' frame, m; -1 for none. */
+/* Writes to ``found`` the number of the surfel that the grid holds for each position (count, 3), surfels' frame, m; -1 for none. */
 WIDE void streetfix_lookup(const Grid *g, const double *positions, int64_t count, int32_t *found)
 {
     Recent recent;
@@ -495,10 +524,11 @@ WIDE void streetfix_lookup(const Grid *g, const double *positions, int64_t count
         double at[3][BATCH_SIZE] = {{0}};
         float local[3][BATCH_SIZE];
         int64_t rows[BATCH_SIZE];
+        const Piece *pieces[BATCH_SIZE];
         for (int64_t k = 0; k < some; k++)
             for (int a = 0; a < 3; a++) at[a][k] = positions[3 * (first + k) + a];
-        find_cells(g, at, some, &recent, local, rows);
-        for (int64_t k = 0; k < some; k++) found[first + k] = (int32_t)rows[k];
+        find_cells(g, at, some, &recent, local, pieces, rows);
+        for (int64_t k = 0; k < some; k++) found[first + k] = rows[k] < 0 ? -1 : (int32_t)(pieces[k]->first + rows[k]);
     }
 }
 
@@ -660,13 +690,12 @@ void streetfix_fill_slots(const Region *regions, int64_t count, int64_t slot_bit
     }
 }
 
-/* Renders the depth (z, m) of the surfels, each a small square that faces the camera; 1e9 where nothing is mapped. ``cell``: edge of a cell,
- * m. Cubes out of reach or outside the field of view are skipped. R and t are T_map_camera. */
+/* Renders the surfels, each a small square that faces the camera, into ``depth`` (z, m), which has larger values where nothing is nearer.
+ * ``cell``: edge of a cell, m. Cubes out of reach or outside the field of view are skipped. R and t are T_map_camera. */
 void streetfix_render(const PackedSurfel *surfels, const Cube *cubes, int64_t cube_count, double cell, const double *R, const double *t,
                       double fx, double fy, double cx, double cy, int64_t width, int64_t height, double half_size, double reach,
                       float *depth)
 {
-    for (int64_t i = 0; i < width * height; i++) depth[i] = 1e9f;
     const float r[9] = {(float)R[0], (float)R[1], (float)R[2], (float)R[3], (float)R[4],
                         (float)R[5], (float)R[6], (float)R[7], (float)R[8]};
     const float far = (float)reach, step = (float)(cell / STEPS);
@@ -760,9 +789,11 @@ const LayoutEntry streetfix_layout[] = {
     LAYOUT_STRUCT(Block), LAYOUT_FIELD(Block, filled), LAYOUT_FIELD(Block, first), LAYOUT_FIELD(Block, before),
     LAYOUT_STRUCT(Region), LAYOUT_FIELD(Region, key), LAYOUT_FIELD(Region, block), LAYOUT_FIELD(Region, surfel),
     LAYOUT_FIELD(Region, other), LAYOUT_FIELD(Region, surfels), LAYOUT_FIELD(Region, others), LAYOUT_FIELD(Region, row),
+    LAYOUT_STRUCT(Piece), LAYOUT_FIELD(Piece, slot_bits), LAYOUT_FIELD(Piece, slots), LAYOUT_FIELD(Piece, regions),
+    LAYOUT_FIELD(Piece, blocks), LAYOUT_FIELD(Piece, nearest), LAYOUT_FIELD(Piece, nearest_bytes), LAYOUT_FIELD(Piece, others),
+    LAYOUT_FIELD(Piece, surfels), LAYOUT_FIELD(Piece, served), LAYOUT_FIELD(Piece, shift), LAYOUT_FIELD(Piece, first),
     LAYOUT_STRUCT(Grid), LAYOUT_FIELD(Grid, ox), LAYOUT_FIELD(Grid, oy), LAYOUT_FIELD(Grid, oz),
-    LAYOUT_FIELD(Grid, cell), LAYOUT_FIELD(Grid, slot_bits), LAYOUT_FIELD(Grid, slots), LAYOUT_FIELD(Grid, regions),
-    LAYOUT_FIELD(Grid, blocks), LAYOUT_FIELD(Grid, nearest), LAYOUT_FIELD(Grid, nearest_bytes), LAYOUT_FIELD(Grid, others),
+    LAYOUT_FIELD(Grid, cell), LAYOUT_FIELD(Grid, count), LAYOUT_FIELD(Grid, pieces),
     LAYOUT_STRUCT(Query), LAYOUT_FIELD(Query, count), LAYOUT_FIELD(Query, xyz), LAYOUT_FIELD(Query, ray),
     LAYOUT_FIELD(Query, sigma), LAYOUT_FIELD(Query, weight), LAYOUT_FIELD(Query, q),
     LAYOUT_STRUCT(Options), LAYOUT_FIELD(Options, iterations), LAYOUT_FIELD(Options, reach),

@@ -6,7 +6,7 @@ Speed: a solver step takes a sixth of the time of NumPy over all starts at once 
 """
 
 import ctypes
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from ctypes import POINTER, Structure, byref, c_double, c_int64, c_void_p
 from dataclasses import astuple, dataclass, field, fields
 from functools import cache
@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float32, Float64, Int32
+from jaxtyping import Bool, Float32, Float64, Int32
 from numpy.typing import NDArray
 
 from service.compiled import load
@@ -68,13 +68,22 @@ STATE = np.dtype(
 )  # fmt: skip
 
 
-class _Grid(Structure):
+class _Piece(Structure):
     _fields_ = [
-        *((name, c_double) for name in ("ox", "oy", "oz", "cell")),
         ("slot_bits", c_int64),
         *((name, c_void_p) for name in ("slots", "regions", "blocks", "nearest")),
         ("nearest_bytes", c_int64),
-        ("others", c_void_p),
+        *((name, c_void_p) for name in ("others", "surfels", "served")),
+        ("shift", c_int64 * 3),
+        ("first", c_int64),
+    ]
+
+
+class _Grid(Structure):
+    _fields_ = [
+        *((name, c_double) for name in ("ox", "oy", "oz", "cell")),
+        ("count", c_int64),
+        ("pieces", POINTER(_Piece)),
     ]
 
 
@@ -171,6 +180,7 @@ def _library() -> ctypes.CDLL:
             "Cube": CUBE,
             "Block": GRID_BLOCK,
             "Region": GRID_REGION,
+            "Piece": _Piece,
             "Grid": _Grid,
             "Query": _Query,
             "Options": _Options,
@@ -188,7 +198,6 @@ def _library() -> ctypes.CDLL:
     )
     library.streetfix_align.argtypes = [
         POINTER(_Grid),
-        c_void_p,
         POINTER(_Query),
         POINTER(_Options),
         c_double,
@@ -198,7 +207,6 @@ def _library() -> ctypes.CDLL:
     ]
     library.streetfix_gradients.argtypes = [
         POINTER(_Grid),
-        c_void_p,
         POINTER(_Query),
         POINTER(_Options),
         c_void_p,
@@ -235,6 +243,15 @@ def _library() -> ctypes.CDLL:
     return library
 
 
+def numbers_of_regions(keys: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Return the numbers of regions along x, y and z from the corner of their grid (n, 3).
+
+    Args:
+        keys: keys of the regions (n,).
+    """
+    return np.stack([keys >> 2 * KEY_BITS, keys >> KEY_BITS, keys], axis=1) & ((1 << KEY_BITS) - 1)
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class NearestGrid:
     """Lookup grid of the surfel nearest to each cell's centre; may be memory-mapped.
@@ -265,9 +282,8 @@ class NearestGrid:
     cubes: NDArray[Any] = field(init=False)
 
     def __post_init__(self) -> None:
-        cubes, key = np.empty(len(self.regions), CUBE), self.regions["key"]
-        numbers = np.stack([key >> 2 * KEY_BITS, key >> KEY_BITS, key], axis=1) & ((1 << KEY_BITS) - 1)
-        cubes["corner"] = self.origin_m + numbers * self.region_m
+        cubes = np.empty(len(self.regions), CUBE)
+        cubes["corner"] = self.origin_m + numbers_of_regions(self.regions["key"]) * self.region_m
         cubes["first"], cubes["count"] = self.regions["surfel"], self.regions["surfels"]
         object.__setattr__(self, "cubes", cubes)
 
@@ -275,17 +291,6 @@ class NearestGrid:
     def region_m(self) -> float:
         """Edge of a region, m."""
         return REGION * BLOCK * self.cell_m
-
-    def surfels_at(self, positions_m: Float64[NDArray[np.float64], "n 3"]) -> Int32[NDArray[np.int32], " n"]:
-        """Return the row of the surfel that the cell of each position refers to; -1 for none.
-
-        Args:
-            positions_m: positions in the surfels' frame, m.
-        """
-        positions_m = np.ascontiguousarray(positions_m, np.float64)
-        found = np.empty(len(positions_m), np.int32)
-        _library().streetfix_lookup(byref(self._as_c()), positions_m.ctypes.data, len(positions_m), found.ctypes.data)
-        return found
 
     def unpacked(self, surfels: NDArray[Any], rows: NDArray[np.integer[Any]]) -> NDArray[Any]:
         """Return surfels as numbers: (n,) of ``SURFEL``.
@@ -311,14 +316,71 @@ class NearestGrid:
         )
         return found
 
-    def _as_c(self) -> _Grid:
-        slots, regions, blocks, nearest, others = (
-            each.ctypes.data for each in (self.slots, self.regions, self.blocks, self.nearest, self.others)
-        )
-        slot_bits = len(self.slots).bit_length() - 1
-        return _Grid(
-            *self.origin_m, self.cell_m, slot_bits, slots, regions, blocks, nearest, self.nearest.itemsize, others
-        )
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Piece:
+    """Surfels with their lookup grid: those of a map of one bundle, or those that a tile gives to the surroundings of a pose.
+
+    The pieces of one cloud lie in a common frame. They have cells of one size, and the corners of their grids are whole regions apart.
+
+    Attributes:
+        grid: lookup grid of the surfels.
+        surfels: (S,) of ``PACKED_SURFEL``, in their own frame.
+        at_m: origin of that frame in the common frame, m.
+        served: the regions of the grid that this piece gives to the cloud (R,). None gives all. Each region comes from one piece.
+        cubes: the surfels of these regions, with corners in the common frame: (n,) of ``CUBE``; computed.
+    """
+
+    grid: NearestGrid
+    surfels: NDArray[Any]
+    at_m: Float64[NDArray[np.float64], "3"] = field(default_factory=lambda: np.zeros(3))
+    served: Bool[NDArray[np.bool_], " R"] | None = None
+    cubes: NDArray[Any] = field(init=False)
+
+    def __post_init__(self) -> None:
+        cubes = self.grid.cubes
+        if self.served is not None:
+            cubes = cubes[self.served]
+            cubes["corner"] += self.at_m
+        object.__setattr__(self, "cubes", cubes)
+
+    @property
+    def corner_m(self) -> Float64[NDArray[np.float64], "3"]:
+        """Corner of the grid in the common frame, m."""
+        return self.at_m + self.grid.origin_m
+
+
+def surfels_at(
+    pieces: tuple[Piece, ...], positions_m: Float64[NDArray[np.float64], "n 3"]
+) -> Int32[NDArray[np.int32], " n"]:
+    """Return the number of the surfel that the cell of each position refers to; -1 for none. The surfels of all pieces count.
+
+    Args:
+        pieces: of the cloud.
+        positions_m: positions in the common frame, m.
+    """
+    positions_m = np.ascontiguousarray(positions_m, np.float64)
+    found = np.empty(len(positions_m), np.int32)
+    _library().streetfix_lookup(byref(_grid_of(pieces)), positions_m.ctypes.data, len(positions_m), found.ctypes.data)
+    return found
+
+
+def _grid_of(pieces: tuple[Piece, ...]) -> _Grid:
+    """Return the grid of all pieces as ``kernel.c`` takes it. It refers to their arrays, so they must live as long."""
+    corners = np.array([piece.corner_m for piece in pieces])
+    corner, edge_m = corners.min(axis=0), pieces[0].grid.region_m
+    shifts = np.rint((corners - corner) / edge_m).astype(np.int64)
+    made, first = (_Piece * len(pieces))(), 0
+    for one, piece, shift in zip(made, pieces, shifts, strict=True):
+        grid = piece.grid
+        one.slot_bits = len(grid.slots).bit_length() - 1
+        for name in ("slots", "regions", "blocks", "nearest", "others"):
+            setattr(one, name, getattr(grid, name).ctypes.data)
+        one.nearest_bytes, one.surfels = grid.nearest.itemsize, piece.surfels.ctypes.data
+        one.served = None if piece.served is None else piece.served.ctypes.data
+        one.shift, one.first = (c_int64 * 3)(*shift), first
+        first += len(piece.surfels)
+    return _Grid(*corner, pieces[0].grid.cell_m, len(pieces), made)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -368,8 +430,7 @@ class QueryPoints:
 
 
 def align(
-    grid: NearestGrid,
-    surfels: NDArray[Any],
+    pieces: tuple[Piece, ...],
     query: QueryPoints,
     states: NDArray[Any],
     options: SolverOptions,
@@ -382,10 +443,9 @@ def align(
     The solver minimises weighted, robust point-to-plane distances (Gauss-Newton, Geman-McClure kernel).
 
     Args:
-        grid: lookup grid of the map.
-        surfels: of the map, (S,) of ``PACKED_SURFEL``.
+        pieces: of the map's cloud.
         query: points of the query.
-        states: the starts, (n,) of ``STATE``; overwritten with the results.
+        states: the starts, (n,) of ``STATE``, common frame of the pieces; overwritten with the results.
         options: of the solver; with 0 ``iterations`` the states are only scored.
         tolerance_m: standard deviation of a point's distance to its surface in the score, m, apart from its noise. 0: the results are
             not scored.
@@ -393,8 +453,7 @@ def align(
     """
     points, given = _as_c(query, options)
     _library().streetfix_align(
-        byref(grid._as_c()),
-        surfels.ctypes.data,
+        byref(_grid_of(pieces)),
         byref(points),
         byref(given),
         tolerance_m,
@@ -405,8 +464,7 @@ def align(
 
 
 def gradients(
-    grid: NearestGrid,
-    surfels: NDArray[Any],
+    pieces: tuple[Piece, ...],
     query: QueryPoints,
     state: NDArray[Any],
     options: SolverOptions,
@@ -415,18 +473,16 @@ def gradients(
     """Sum the gradients of each patch's points at a pose: weight x residual x derivative by the eight unknowns.
 
     Args:
-        grid: lookup grid of the map.
-        surfels: of the map, (S,) of ``PACKED_SURFEL``.
+        pieces: of the map's cloud.
         query: points of the query.
-        state: the pose, (1,) of ``STATE``.
+        state: the pose, (1,) of ``STATE``, common frame of the pieces.
         options: of the solver. The robust kernel has the width of the last iteration.
         patch: number of each point's patch, counted from 0 without gaps.
     """
     found = np.zeros((int(patch.max(initial=-1)) + 1, UNKNOWNS))
     points, given = _as_c(query, options)
     _library().streetfix_gradients(
-        byref(grid._as_c()),
-        surfels.ctypes.data,
+        byref(_grid_of(pieces)),
         byref(points),
         byref(given),
         state.ctypes.data,
@@ -496,13 +552,21 @@ def packed_map(
     return nearest_grid(packed), packed.surfels, order
 
 
-def packed_surfels(surfels: NDArray[Any], *, cell_m: float, reach_m: float) -> tuple[PackedSurfels, NDArray[np.int64]]:
+def packed_surfels(
+    surfels: NDArray[Any],
+    *,
+    cell_m: float,
+    reach_m: float,
+    lattice_m: Float64[NDArray[np.float64], "3"] | None = None,
+) -> tuple[PackedSurfels, NDArray[np.int64]]:
     """Pack the surfels of a map.
 
     Args:
         surfels: of the map, (S,) of ``SURFEL``, in any order.
         cell_m: edge of a cell of their lookup grid, m.
         reach_m: largest distance from a surfel to the centre of a cell that refers to it, m.
+        lattice_m: a position in the surfels' frame. The corner of the grid lies whole regions away from it, so that grids with one lattice
+            fit together. None puts the corner just below the surfels.
 
     Returns:
         The packed surfels, and their rows in ``surfels`` (S,).
@@ -516,6 +580,9 @@ def packed_surfels(surfels: NDArray[Any], *, cell_m: float, reach_m: float) -> t
             raise StreetfixError(f"surfels: a number of {name} is not finite; remove the points that cause it")
     low, high = surfels["xyz"].min(axis=0).astype(np.float64), surfels["xyz"].max(axis=0).astype(np.float64)
     origin = low - reach_m - 2 * cell_m
+    if lattice_m is not None:
+        region_m = REGION * BLOCK * cell_m
+        origin = lattice_m + np.floor((origin - lattice_m) / region_m) * region_m
     extent_m, most_m = float((high + reach_m - origin).max()), (1 << KEY_BITS) * REGION * BLOCK * cell_m
     if not extent_m < most_m:
         raise StreetfixError(
@@ -535,19 +602,25 @@ def packed_surfels(surfels: NDArray[Any], *, cell_m: float, reach_m: float) -> t
     return PackedSurfels(packed, own, origin, cell_m, reach_m), order
 
 
-def nearest_grid(packed: PackedSurfels) -> NearestGrid:
+#: Chooses regions by their centres, m: (n, 3) to (n,).
+ChooseRegions = Callable[[Float64[NDArray[np.float64], "n 3"]], Bool[NDArray[np.bool_], " n"]]
+
+
+def nearest_grid(packed: PackedSurfels, has_cells: ChooseRegions | None = None) -> NearestGrid:
     """Build the lookup grid of the surfels of a map.
 
     It is built region by region. The memory grows with the number of surfels, not with the distances between them.
 
     Args:
         packed: the surfels.
+        has_cells: chooses the regions that get cells, by their centres in the surfels' frame. The surfels of other regions only serve the
+            cells of these. None gives all regions cells.
     """
     origin, cell_m = packed.origin_m, packed.cell_m
     xyz = _positions(_without_cells(origin, cell_m, packed.regions), packed.surfels)
     regions, blocks, nearest, others = [], [np.zeros(0, GRID_BLOCK)], [np.zeros(0, np.uint16)], [np.zeros(0, np.int32)]
     first_block = first_cell = first_other = 0
-    for region, some, cells in _regions(xyz, packed.regions, origin, cell_m, packed.reach_m):
+    for region, some, cells in _regions(xyz, packed.regions, origin, cell_m, packed.reach_m, has_cells):
         numbers, foreign = _numbered(cells, region)
         region["block"], region["other"], region["others"] = first_block, first_other, len(foreign)
         some["first"] += first_cell
@@ -599,6 +672,7 @@ def _regions(
     origin_m: Float64[NDArray[np.float64], "3"],
     cell_m: float,
     reach_m: float,
+    has_cells: ChooseRegions | None,
 ) -> Iterator[tuple[NDArray[Any], NDArray[Any], Int32[NDArray[np.int32], " f"]]]:
     """Yield the regions, ascending by key: the region (1,), its blocks, and the rows of the surfels of their filled cells.
 
@@ -609,6 +683,9 @@ def _regions(
     touched, starts, which = _touched(xyz, origin_m, edge * cell_m, reach_m)
     keys = np.union1d(touched, own["key"])
     reached = np.searchsorted(touched, keys), np.searchsorted(touched, keys, side="right")
+    if has_cells is not None:  # no surfel reaches a region without cells
+        without = ~has_cells(origin_m + (numbers_of_regions(keys) + 0.5) * (edge * cell_m))
+        reached[1][without] = reached[0][without]
     first_own = np.searchsorted(own["key"], keys)
     surfel_of, distance2 = np.empty(edge**3, np.int32), np.empty(edge**3, np.float32)
     blocks, nearest = np.empty(REGION**3, GRID_BLOCK), np.empty(edge**3, np.int32)
@@ -681,8 +758,7 @@ def _touched(
 
 
 def render(
-    grid: NearestGrid,
-    surfels: NDArray[Any],
+    pieces: tuple[Piece, ...],
     *,
     T_map_camera: Float64[NDArray[np.float64], "4 4"],
     camera: PinholeCamera,
@@ -692,32 +768,32 @@ def render(
     """Render the depth image that a camera would see of the surfels: z in metres, 0 where nothing is mapped.
 
     Args:
-        grid: lookup grid of the map.
-        surfels: of the map, (S,) of ``PACKED_SURFEL``.
-        T_map_camera: pose of the camera in the surfels' frame.
+        pieces: of the map's cloud.
+        T_map_camera: pose of the camera in the common frame of the pieces.
         camera: intrinsics of the rendered image, a small one.
         size_m: edge of the square that represents a surfel, m.
         reach_m: surfels beyond this depth are not rendered, m.
     """
-    depth = np.empty((camera.height, camera.width), np.float32)
+    depth = np.full((camera.height, camera.width), 1e9, np.float32)
     R, t = np.ascontiguousarray(T_map_camera[:3, :3]), np.ascontiguousarray(T_map_camera[:3, 3])
-    _library().streetfix_render(
-        surfels.ctypes.data,
-        grid.cubes.ctypes.data,
-        len(grid.cubes),
-        grid.cell_m,
-        R.ctypes.data,
-        t.ctypes.data,
-        camera.fx,
-        camera.fy,
-        camera.cx,
-        camera.cy,
-        camera.width,
-        camera.height,
-        size_m / 2,
-        reach_m,
-        depth.ctypes.data,
-    )
+    for piece in pieces:
+        _library().streetfix_render(
+            piece.surfels.ctypes.data,
+            piece.cubes.ctypes.data,
+            len(piece.cubes),
+            piece.grid.cell_m,
+            R.ctypes.data,
+            t.ctypes.data,
+            camera.fx,
+            camera.fy,
+            camera.cx,
+            camera.cy,
+            camera.width,
+            camera.height,
+            size_m / 2,
+            reach_m,
+            depth.ctypes.data,
+        )
     depth[depth > 1e8] = 0
     return depth
 

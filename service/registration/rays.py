@@ -26,7 +26,7 @@ from service.geometry.rigid import Rotation, Transform, transform_from
 from service.registration.kernel import SURFEL, UNKNOWNS
 from service.registration.points import DepthBlocks
 from service.registration.register import Registered
-from service.registration.surfel_map import SurfelMap
+from service.registration.surfel_tiles import Surfels
 from service.registration.visibility import LIBRARY, DiscSettings, SurfelRaycaster, View
 
 #: Standard deviation of a rig's disparity offset, px. With SGBM the offset was 0.1 to 0.46 px on real frames (feasibility study).
@@ -230,7 +230,7 @@ def cast_rays(
     return [raycaster.intersect(state.camera_of(picture), picture.camera) for picture in pictures]
 
 
-def _state_of(cloud: SurfelMap, found: Registered) -> _State:
+def _state_of(cloud: Surfels, found: Registered) -> _State:
     return _State(found.R_map_level, found.camera_m - cloud.origin_m, float(np.log(found.scale)), found.offset)
 
 

@@ -4,7 +4,7 @@
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -13,12 +13,16 @@ from numpy.typing import NDArray
 
 from service.errors import BundleError
 from service.registration.kernel import (
+    BLOCK,
     GRID_BLOCK,
     GRID_REGION,
     PACKED_SURFEL,
+    REGION,
     TOLERANCE_M,
+    ChooseRegions,
     NearestGrid,
     PackedSurfels,
+    Piece,
     QueryPoints,
     SolverOptions,
     align,
@@ -28,6 +32,8 @@ from service.registration.kernel import (
 
 #: Edge of a cell of the lookup grid, and largest distance from a surfel to a cell that refers to it, m.
 CELL_M, REACH_M = 0.4, 1.2
+#: Edge of a region of the lookup grid, m.
+REGION_M = REGION * BLOCK * CELL_M
 #: Largest coordinate of the corner of a grid, and largest edge of a cell, m. A damaged file may hold any number.
 MOST_AWAY_M, LARGEST_CELL_M = 1e7, 10.0
 
@@ -60,12 +66,17 @@ class SurfelMap:
         surfels: (S,) of ``PACKED_SURFEL``, sorted by region of the grid.
         grid: lookup grid of the nearest surfel.
         brightness: mean intensity of each surfel's returns in the sensor's unit, NaN where unknown; None if the map has no intensities.
+        pieces: surfels and grid as the kernel takes them; computed.
     """
 
     origin_m: Float64[NDArray[np.float64], "3"]
     surfels: NDArray[Any]
     grid: NearestGrid
     brightness: Float16[NDArray[np.float16], " s"] | None = None
+    pieces: tuple[Piece, ...] = field(init=False)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "pieces", (Piece(self.grid, self.surfels),))
 
     @classmethod
     def prepare(
@@ -86,18 +97,21 @@ class SurfelMap:
 
     @staticmethod
     def packed(
-        surfels: NDArray[Any], brightness: Float32[NDArray[np.float32], " s"] | None = None
+        surfels: NDArray[Any],
+        brightness: Float32[NDArray[np.float32], " s"] | None = None,
+        lattice_m: Float64[NDArray[np.float64], "3"] | None = None,
     ) -> tuple[PackedSurfels, Float16[NDArray[np.float16], " s"] | None]:
         """Pack the surfels of a map: the first half of ``prepare``. The second half does not need them any more.
 
         Args:
             surfels: as of ``prepare``.
             brightness: as of ``prepare``.
+            lattice_m: as of ``kernel.packed_surfels``.
 
         Returns:
             The packed surfels, and their intensities as a map holds them.
         """
-        found, order = packed_surfels(surfels, cell_m=CELL_M, reach_m=REACH_M)
+        found, order = packed_surfels(surfels, cell_m=CELL_M, reach_m=REACH_M, lattice_m=lattice_m)
         if brightness is None:
             return found, None
         half = np.minimum(brightness[order], np.finfo(_BRIGHT).max).astype(_BRIGHT)
@@ -109,6 +123,7 @@ class SurfelMap:
         origin_m: Float64[NDArray[np.float64], "3"],
         packed: PackedSurfels,
         brightness: Float16[NDArray[np.float16], " s"] | None,
+        has_cells: ChooseRegions | None = None,
     ) -> "SurfelMap":
         """Build the lookup grid of packed surfels: the second half of ``prepare``.
 
@@ -116,8 +131,9 @@ class SurfelMap:
             origin_m: origin of the surfels' frame, map frame, m.
             packed: the surfels.
             brightness: their intensities; None if the map has none.
+            has_cells: as of ``kernel.nearest_grid``.
         """
-        return cls(origin_m, packed.surfels, nearest_grid(packed), brightness)
+        return cls(origin_m, packed.surfels, nearest_grid(packed, has_cells), brightness)
 
     def unpacked(self, rows: NDArray[np.integer[Any]] | slice) -> NDArray[Any]:
         """Return surfels as numbers: (n,) of ``SURFEL``, in the surfels' frame.
@@ -128,6 +144,14 @@ class SurfelMap:
         if isinstance(rows, slice):
             rows = np.arange(*rows.indices(len(self.surfels)))
         return self.grid.unpacked(self.surfels, rows)
+
+    def brightness_of(self, rows: NDArray[np.integer[Any]]) -> Float32[NDArray[np.float32], " *n"] | None:
+        """Return the intensities of some surfels in the sensor's unit, NaN where unknown; None if the map has no intensities.
+
+        Args:
+            rows: rows in ``surfels``, of any shape.
+        """
+        return None if self.brightness is None else self.brightness[rows].astype(np.float32)
 
     @property
     def has_brightness(self) -> bool:
@@ -168,7 +192,7 @@ class SurfelMap:
             tolerance_m: standard deviation of a point's distance to its surface in the score, m, apart from its noise.
             height_min_m: points lower than this do not count in the score, m.
         """
-        align(self.grid, self.surfels, points, states, options, tolerance_m=tolerance_m, height_min_m=height_min_m)
+        align(self.pieces, points, states, options, tolerance_m=tolerance_m, height_min_m=height_min_m)
 
     def arrays(self) -> dict[str, NDArray[Any]]:
         """Return the arrays to write, by name; ``from_arrays`` reads them again.

@@ -22,9 +22,8 @@ from service.compiled import load
 from service.geometry.camera import PinholeCamera
 from service.geometry.rigid import Transform
 from service.imaging.view_grid import MAX_RANGE_M
-from service.registration.kernel import CUBE, PACKED_SURFEL, SURFEL
-from service.registration.surfel_map import SurfelMap
-from service.registration.surfel_tiles import Cloud
+from service.registration.kernel import CUBE, PACKED_SURFEL, SURFEL, Piece
+from service.registration.surfel_tiles import Cloud, Surfels
 
 LIBRARY = Path(__file__).with_name("_rays.so")
 #: Largest distance (m) and rotation (rad) of a pose from the one whose collected surfels it reuses.
@@ -166,14 +165,14 @@ class SurfelRaycaster:
     """Ray casting for one request; each pose of a camera is computed once.
 
     Attributes:
-        cloud: surfel map.
+        cloud: surfels of the map.
     """
 
-    def __init__(self, cloud: SurfelMap, settings: DiscSettings) -> None:
+    def __init__(self, cloud: Surfels, settings: DiscSettings) -> None:
         """Prepare ray casting on a map.
 
         Args:
-            cloud: surfel map.
+            cloud: surfels of the map.
             settings: of the discs.
         """
         self.cloud = cloud
@@ -218,27 +217,32 @@ class SurfelRaycaster:
         return surfel_of
 
     def _collect(self, T_map_camera: Transform, camera: PinholeCamera) -> _Collection:
-        cubes = self._cubes_in_view(T_map_camera, camera)
-        room = int(cubes["count"].sum())
+        pieces = self.cloud.pieces
+        visible = [self._cubes_in_view(piece, T_map_camera, camera) for piece in pieces]
+        room = sum(int(cubes["count"].sum()) for cubes in visible)
         surfels, numbers = np.empty(room, SURFEL), np.empty(room, np.int32)
-        count = _library().streetfix_collect(
-            self.cloud.surfels.ctypes.data,
-            cubes.ctypes.data,
-            len(cubes),
-            self.cloud.grid.cell_m,
-            byref(View.of(T_map_camera, camera)),
-            byref(self._discs),
-            NEAR_M + ROUNDING,
-            NEAR_RAD + ROUNDING,
-            surfels.ctypes.data,
-            numbers.ctypes.data,
-        )
+        count = first = 0
+        for piece, cubes in zip(pieces, visible, strict=True):
+            found = _library().streetfix_collect(
+                piece.surfels.ctypes.data,
+                cubes.ctypes.data,
+                len(cubes),
+                piece.grid.cell_m,
+                byref(View.of(T_map_camera, camera)),
+                byref(self._discs),
+                NEAR_M + ROUNDING,
+                NEAR_RAD + ROUNDING,
+                surfels[count:].ctypes.data,
+                numbers[count:].ctypes.data,
+            )
+            numbers[count : count + found] += first
+            count, first = count + found, first + len(piece.surfels)
         for each in (surfels, numbers):
             each.resize(count, refcheck=False)  # frees the unused memory
         return _Collection(T_map_camera, camera, surfels, numbers)
 
-    def _cubes_in_view(self, T_map_camera: Transform, camera: PinholeCamera) -> NDArray[Any]:
-        """Cubes of the regions that a camera may see from near a pose: (n,) of ``CUBE``.
+    def _cubes_in_view(self, piece: Piece, T_map_camera: Transform, camera: PinholeCamera) -> NDArray[Any]:
+        """Cubes of a piece's regions that a camera may see from near a pose: (n,) of ``CUBE``.
 
         Seen from above, the field of view lies in the convex hull of five points. They are the camera and the four corners of the image
         at the largest depth.
@@ -247,7 +251,7 @@ class SurfelRaycaster:
         x, y = np.meshgrid((u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy)
         corners = self._settings.reach_m * np.stack([x.ravel(), y.ravel(), np.ones(4)], axis=1) @ T_map_camera[:3, :3].T
         hull = np.vstack([np.zeros(2), corners[:, :2]])
-        cubes, edge_m = self.cloud.grid.cubes, self.cloud.grid.region_m
+        cubes, edge_m = piece.cubes, piece.grid.region_m
         centres = cubes["corner"][:, :2] + edge_m / 2 - T_map_camera[:2, 3]
         motion_m = NEAR_M + NEAR_RAD * float(np.linalg.norm(corners, axis=1).max())
         half = edge_m / np.sqrt(2) + self._settings.radius_m + motion_m

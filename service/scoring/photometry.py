@@ -13,12 +13,13 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float16, Float32, Int32, UInt8
+from jaxtyping import Bool, Float32, Int32, UInt8
 from numpy.typing import NDArray
 
 from service.geometry.camera import PinholeCamera
 from service.registration.rays import cast_rays
 from service.registration.register import Registered
+from service.registration.surfel_tiles import Surfels
 from service.registration.visibility import Raycasters
 from service.scoring.measured import MeasuredFrame
 from service.scoring.scorer import Scores
@@ -82,7 +83,7 @@ def seen_by_lens(
 
 
 def agreement_of_brightness(
-    brightness: Float16[NDArray[np.float16], " n"],
+    surfels: Surfels,
     surfel_of: Int32[NDArray[np.int32], "H W"],
     grey: Float32[NDArray[np.float32], "H W"],
     settings: PhotometrySettings,
@@ -92,21 +93,22 @@ def agreement_of_brightness(
     The score is 0 where no visible surfel has a brightness.
 
     Args:
-        brightness: LiDAR intensity of each surfel, NaN where unknown.
+        surfels: surfels of the map, with intensities.
         surfel_of: index of the surfel in each pixel of the small image, -1 for none, as ``SurfelRaycaster.intersect`` returns it.
         grey: logarithmic grey levels, as ``grey_of`` returns them.
         settings: of the score.
     """
-    return squared_correlation(_rendered(brightness, surfel_of, settings), grey, settings)
+    return squared_correlation(_rendered(surfels, surfel_of, settings), grey, settings)
 
 
 def _rendered(
-    brightness: Float16[NDArray[np.float16], " n"],
+    surfels: Surfels,
     surfel_of: Int32[NDArray[np.int32], "H W"],
     settings: PhotometrySettings,
 ) -> Float32[NDArray[np.float32], "H W"]:
     """Logarithm of the brightness of each pixel's surfel, relative to the mean; NaN where unknown."""
-    values = np.where(surfel_of >= 0, brightness[np.maximum(surfel_of, 0)], np.float32(np.nan))
+    brightness = surfels.brightness_of(np.maximum(surfel_of, 0))
+    values = np.where(surfel_of >= 0, np.float32(np.nan) if brightness is None else brightness, np.float32(np.nan))
     known = values[~np.isnan(values)]
     mean = float(known.mean()) if known.size else 0.0
     if not mean > 0:
@@ -200,11 +202,10 @@ class BrightnessScorer:
         found = []
         for each, seen, grey in zip(self._measured, self._seen, greys, strict=True):
             raycaster = self._raycasters.at(each.pose(pose).camera_m)
-            brightness = raycaster.cloud.brightness
-            if brightness is None:
+            if not raycaster.cloud.has_brightness:
                 return 0.0
             (surfel_of,) = cast_rays(raycaster, [each.picture], pose)
             if seen is not None:
                 surfel_of = np.where(seen, surfel_of, np.int32(-1))
-            found.append(agreement_of_brightness(brightness, surfel_of, grey, self._settings))
+            found.append(agreement_of_brightness(raycaster.cloud, surfel_of, grey, self._settings))
         return float(np.mean(found))

@@ -14,8 +14,7 @@ from service.geometry.camera import PinholeCamera
 from service.geometry.rigid import Rotation, transform_from
 from service.registration.kernel import BeamModel, QueryPoints, consistency, render
 from service.registration.register import Registered
-from service.registration.surfel_map import SurfelMap
-from service.registration.surfel_tiles import Cloud
+from service.registration.surfel_tiles import Cloud, Surfels
 from service.scoring.measured import MeasuredFrame
 from service.scoring.scorer import Scores
 
@@ -107,18 +106,17 @@ def project_points(points: QueryPoints, camera: PinholeCamera, R_level_camera: R
     return ProjectedPoints(small, R_level_camera, pixel, z.astype(np.float64), sigma, points.q)
 
 
-def agreement(cloud: SurfelMap, projected: ProjectedPoints, candidate: Registered) -> Agreement:
+def agreement(cloud: Surfels, projected: ProjectedPoints, candidate: Registered) -> Agreement:
     """Render the map at a candidate's pose and compare the query's depth with it.
 
     Args:
-        cloud: surfel map.
+        cloud: surfels around the pose.
         projected: projected points of the query.
         candidate: the registered pose, map frame.
     """
     T = transform_from(candidate.R_map_level @ projected.R_level_camera, candidate.camera_m - cloud.origin_m)
     rendered = render(
-        cloud.grid,
-        cloud.surfels,
+        cloud.pieces,
         T_map_camera=T,
         camera=projected.camera,
         size_m=SURFEL_M,

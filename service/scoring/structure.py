@@ -120,8 +120,7 @@ def rendered(
     """
     surfels = cloud.at(camera_m)
     return render(
-        surfels.grid,
-        surfels.surfels,
+        surfels.pieces,
         T_map_camera=transform_from(R_map_camera, camera_m - surfels.origin_m),
         camera=CAMERA,
         size_m=SURFEL_M,

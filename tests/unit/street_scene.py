@@ -108,8 +108,8 @@ FINE = {"iterations": 20, "reach": 1.2, "robust_first": 0.6, "robust_last": 0.06
 def settled(cloud: SurfelMap, points: QueryPoints, states: Any, **changed: Any) -> Any:
     """Run a coarse and an exact solver. The given starts stay unchanged."""
     states = states.copy()
-    align(cloud.grid, cloud.surfels, points, states, SolverOptions(**(COARSE | changed)))
-    align(cloud.grid, cloud.surfels, points, states, SolverOptions(**(FINE | changed)))
+    align(cloud.pieces, points, states, SolverOptions(**(COARSE | changed)))
+    align(cloud.pieces, points, states, SolverOptions(**(FINE | changed)))
     return states
 
 

@@ -23,12 +23,12 @@ from model_training.datasets.dataset import Dataset
 from model_training.datasets.stored_survey import dataset_at
 from model_training.datasets.survey_part import SurveyPart
 from model_training.mapping import build_tiled as driver
-from model_training.mapping import engines, site_check
+from model_training.mapping import engines, site_check, tile_area
 from model_training.mapping.build import build_map, describe
 from model_training.mapping.build_tile import build_tile, key_of_tile
 from model_training.mapping.build_tiled import build_tiled
 from model_training.mapping.settings import BuildSettings
-from model_training.mapping.tiles import TILE_MARGIN_M
+from model_training.mapping.tile_area import OVERLAP_M, Square, TileArea
 from model_training.mapping.work import work_folder
 from model_training.tasks import local
 from service.errors import BundleError, DatasetError, ExtraMissingError
@@ -39,6 +39,8 @@ from service.retrieval.encoder import Encoder
 #: 11 scans along 60 m; the map frame's axes cut them into two tiles.
 SETTINGS = BuildSettings(name="tiled", headings=6, spacing_m=5.0, between_m=3.0, voxel_m=0.6, calibration=None)
 TILE_M = 50.0
+#: At the edge of a cloud, voxels are cut. Points whose surroundings are in the cloud do not count there, metres.
+BESIDE = [(x, y, 0.0) for x in (-1.0, 1.0) for y in (-1.0, 1.0)]
 
 
 class KilledError(Exception):
@@ -119,7 +121,7 @@ def test_a_tiled_map_has_every_place_of_an_untiled_one_in_its_square(small_datas
     rows = []
     for tile in made.tiles:
         bundle = MapBundle.open(tmp_path / "tiled" / tile.folder)
-        assert bundle.manifest.parameters["tile_margin_m"] == TILE_MARGIN_M
+        assert bundle.manifest.parameters["tile_overlap_m"] == OVERLAP_M
         corner, xy = np.array([tile.column, tile.row]) * TILE_M, bundle.T_map_place[:, :2, 3]
         assert ((xy >= corner) & (xy < corner + TILE_M)).all()
         rows += places_of(bundle)
@@ -139,14 +141,13 @@ def test_the_cloud_of_a_tile_is_that_of_an_untiled_map_around_its_square(small_d
     build_map(small_dataset, encoder_file, tmp_path / "whole", settings, threads=1)
     made = build_tiled(small_dataset, encoder_file, tmp_path / "tiled", settings, tile_m=TILE_M)
     whole = positions_of(MapBundle.open(tmp_path / "whole").cloud)
+    squares = {(tile.column, tile.row) for tile in made.tiles}
     for tile in made.tiles:
-        low = np.array([tile.column, tile.row]) * TILE_M - TILE_MARGIN_M
+        area = TileArea(Square(tile.column, tile.row, TILE_M), squares)
         found = positions_of(MapBundle.open(tmp_path / "tiled" / tile.folder).cloud)
-        assert ((found[:, :2] >= low - 1e-3) & (found[:, :2] < low + TILE_M + 2 * TILE_MARGIN_M + 1e-3)).all()
-        # At the border of the cloud, voxels are cut.
-        low, high = low + 1.0, low + TILE_M + 2 * TILE_MARGIN_M - 1.0
+        assert area.is_in_cloud(found).all()
         for some, every in ((found, whole), (whole, found)):
-            inner = some[((some[:, :2] > low) & (some[:, :2] < high)).all(axis=1)]
+            inner = some[np.all([area.is_in_cloud(some + beside) for beside in BESIDE], axis=0)]
             tree: Any = cKDTree(every)
             distance, nearest = tree.query(inner)
             assert len(inner) == len(set(nearest.tolist())) > 1000
@@ -372,19 +373,25 @@ def test_ray_gives_the_same_bytes(small_dataset, encoder_file, undisturbed, tmp_
 def test_tiles_check_the_confidence_with_scans_of_their_own(
     small_dataset, encoder_file, calibration_file_of, serial, tmp_path, monkeypatch
 ):
+    """They are places whose surroundings are in the cloud of the tile alone."""
     monkeypatch.setattr(site_check, "_EACH", 2)
     monkeypatch.setattr(site_check, "FEWEST", 1)
+    monkeypatch.setattr(tile_area, "SURROUNDING_M", 5.0)
     calibration = calibration_file_of(Encoder.open(encoder_file).sha256)
     settings = replace(SETTINGS, calibration=calibration)
     made = build_tiled(small_dataset, encoder_file, tmp_path / "m", settings, tile_m=TILE_M)
-    queries, counted = 0, 0
+    queries, counted, squares = 0, 0, {(tile.column, tile.row) for tile in made.tiles}
     for tile in made.tiles:
         bundle = MapBundle.open(tmp_path / "m" / tile.folder)
         assert bundle.calibration is not None
         assert bundle.calibration.site is not None
         queries += bundle.calibration.site.queries
-        counted += (tile.counts.places - int(bundle.manifest.parameters["places_between"])) // 2
-    assert queries == counted >= 2
+        at_scan = tile.counts.places - int(bundle.manifest.parameters["places_between"])
+        area = TileArea(Square(tile.column, tile.row, TILE_M), squares)
+        inner = area.surrounds(bundle.T_map_place[:at_scan, :2, 3])
+        assert 2 <= inner.sum() < at_scan
+        counted += int(inner.sum()) // 2
+    assert queries == counted
     whole = json.loads((tmp_path / "m" / "calibration.json").read_text())
     assert whole["site"]["queries"] == queries
 

@@ -25,6 +25,7 @@ from service.maps.reader import MapBundle
 from service.maps.tiled_writer import write_tiled
 from service.maps.tiles import TiledMap
 from service.maps.writer import replace_calibration, write_bundle
+from tests.unit.lattice import on_lattice
 
 TILE_M = 50.0
 
@@ -33,7 +34,9 @@ TILE_M = 50.0
 def squares(small_map: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[tuple[int, int], Path]:
     """Three bundles with a third of the places each, and with the whole cloud. The squares only name them."""
     bundle, folder = MapBundle.open(small_map), tmp_path_factory.mktemp("squares")
-    content = replace(content_of(bundle), cloud=bundle.cloud, statistics=Columns.of(read_statistics(bundle)))
+    content = replace(
+        content_of(bundle), cloud=on_lattice(bundle.cloud), statistics=Columns.of(read_statistics(bundle))
+    )
     third = np.arange(len(bundle.places)) * 3 // len(bundle.places)
     made = {}
     for column in range(3):

@@ -5,14 +5,8 @@ from hypothesis import strategies as st
 
 from model_training.mapping.between import PlannedPlaces
 from model_training.mapping.survey import travelled_m
-from model_training.mapping.tiles import (
-    SCANS_MARGIN_M,
-    TILE_MARGIN_M,
-    Square,
-    columns_and_rows,
-    require_tile_edge,
-    tile_parts,
-)
+from model_training.mapping.tile_area import TILE_MARGIN_M, Square
+from model_training.mapping.tiles import SCANS_MARGIN_M, columns_and_rows, require_tile_edge, tile_parts
 from service.errors import DatasetError
 from service.imaging.view_grid import MAX_RANGE_M
 from service.scoring.rendered_depth import REACH_M
@@ -60,18 +54,26 @@ def test_scans_are_divided_by_their_given_positions():
     }
 
 
-def test_a_tile_reads_the_scans_within_its_margin_only():
-    """The square ends at 100 m, so the last scan of its cloud stands at 190 m."""
-    x_m = [50.0, 189.9, 190.1, -90.0, -90.1]
+def test_a_tile_reads_the_scans_that_measure_its_cloud_only():
+    """The regions of the tile end at 102.4 m. Its cloud ends 1.6 m further, so the last scan of its cloud stands before 144 m."""
+    x_m = [50.0, 143.9, 144.1, -41.5, -41.7]
     found = parts_of([(x, 50.0) for x in x_m])
+    assert sorted(found) == [(-1, 0), (0, 0), (1, 0)]
     assert found[0, 0].order.tolist() == [0, 1, 3]
     np.testing.assert_allclose(found[0, 0].travelled_m, travelled_m(track([(x, 50.0) for x in x_m]))[[0, 1, 3]])
+
+
+def test_a_tile_without_a_neighbour_reads_further():
+    """Nobody drove in the square from 50 to 100 m. So the cloud of the first tile ends at 100 m, and its last scan stands before 140 m."""
+    found = parts_of([(25.0, 25.0), (139.9, 25.0), (140.1, 25.0)], tile_m=50.0)
+    assert sorted(found) == [(0, 0), (2, 0)]
+    assert found[0, 0].order.tolist() == [0, 1]
 
 
 def test_the_cloud_reaches_what_a_camera_at_the_edge_sees():
     part = parts_of([(50.0, 50.0)])[0, 0]
     points = np.array([[149.9, 50.0, 3.0], [150.1, 50.0, 3.0], [-50.0, -50.0, 0.0], [50.0, -50.1, 0.0]])
-    assert part.is_in_cloud(points).tolist() == [True, False, True, False]
+    assert part.area.is_in_cloud(points).tolist() == [True, False, True, False]
     assert max(MAX_RANGE_M, REACH_M) < TILE_MARGIN_M < SCANS_MARGIN_M
 
 
@@ -113,8 +115,8 @@ def test_each_kept_scan_and_each_place_between_scans_is_in_exactly_one_tile(step
     found = parts_of(xy, tile_m=tile_m, between_m=between_m)
     at_scan, on_way = [], []
     for part in found.values():
-        near = part.square.within(SCANS_MARGIN_M, xy)
-        assert part.order.tolist() == np.flatnonzero(near).tolist()
+        assert part.order.tolist() == np.flatnonzero(part.area.reads(xy)).tolist()
+        assert part.square.within(SCANS_MARGIN_M, xy[part.order]).all()
         at_scan += part.order[part.plan.at_scan].tolist()
         for k, shares in part.plan.on_way.items():
             assert part.order[k - 1] == part.order[k] - 1  # both scans are at hand

@@ -25,7 +25,7 @@ from model_training.mapping.build_tiled import build_tiled
 from model_training.mapping.join import of_places
 from model_training.mapping.settings import BuildSettings
 from model_training.mapping.stored_map import content_of, voxels_of
-from model_training.mapping.tiles import TILE_MARGIN_M, Square
+from model_training.mapping.tile_area import Square, TileArea
 from model_training.mapping.update_tile import SURFEL_BYTES, UpdateTask, _without_places, memory_of, update_tile
 from model_training.mapping.update_tiled import update_tiled
 from model_training.mapping.verify import damage_of
@@ -123,9 +123,10 @@ def tiles(path: Path) -> dict[tuple[int, int], Path]:
 
 
 def voxels(square: tuple[int, int], path: Path) -> dict[bytes, int]:
-    """Return the number of points of each voxel of a tile, by its cell. The edge of the margin cuts voxels, so they do not count."""
-    of_tile = voxels_of(MapBundle.open(path))
-    found, inside = of_tile.statistics(), Square(*square, TILE_M).within(TILE_MARGIN_M - 0.6, of_tile.means())
+    """Return the number of points of each voxel of a tile, by its cell. The edge of the cloud cuts voxels, so they do not count."""
+    of_tile, area = voxels_of(MapBundle.open(path)), TileArea(Square(*square, TILE_M), set(tiles(path.parents[1])))
+    found, means = of_tile.statistics(), of_tile.means()
+    inside = np.all([area.is_in_cloud(means + (x, y, 0.0)) for x in (-0.6, 0.6) for y in (-0.6, 0.6)], axis=0)
     return {
         cell.tobytes(): int(points) for cell, points in zip(found["cell"][inside], found["points"][inside], strict=True)
     }
@@ -150,18 +151,25 @@ def test_the_second_half_makes_the_map_of_the_whole(half: Path, second: Dataset,
 
 
 @pytest.mark.usefixtures("serial")
-def test_a_square_without_a_tile_gets_one(whole: Path, small_dataset: Dataset, second: Dataset, tmp_path: Path) -> None:
-    """The old map has one of the two tiles of the street. The new tile has the points of the old survey in its margin too."""
+def test_a_square_without_a_tile_gets_one(
+    whole: Path, small_dataset: Dataset, encoder_file: Path, tmp_path: Path
+) -> None:
+    """The old survey drove in one of the two squares of the street. The new tile has its points in the other square too."""
     of_whole = tiles(whole)
     present, missing = sorted(of_whole.keys() - {FAR})
-    write_tiled(tmp_path / "old", {present: of_whole[present], FAR: of_whole[FAR]}, TILE_M, name="town")
+    columns = np.floor(small_dataset.survey_poses()[:, :2, 3] / TILE_M).astype(int)
+    driven = np.flatnonzero((columns == present).all(axis=1)).tolist()
+    built(written(small_dataset, tmp_path / "driven", driven), encoder_file, tmp_path / "old")
+    assert tiles(tmp_path / "old").keys() == {present}
     update_tiled(tmp_path / "old", small_dataset, tmp_path / "m")
     found = tiles(tmp_path / "m")
-    assert found.keys() == of_whole.keys()
+    assert found.keys() == {present, missing}
     np.testing.assert_allclose(xy(found[missing]), xy(of_whole[missing]), atol=1e-9)
     counts, expected = voxels(missing, found[missing]), voxels(missing, of_whole[missing])
     assert counts.keys() == expected.keys()
-    assert {counts[cell] / expected[cell] for cell in counts} == {1.0, 2.0}
+    ratios = [counts[cell] / expected[cell] for cell in counts]  # the edge of the old cloud cuts voxels
+    assert {1.0, 2.0} <= set(ratios)
+    assert 1.0 <= min(ratios) <= max(ratios) <= 2.0
     counted = MapBundle.open(found[missing]).manifest.parameters["survey_scans"]
     assert counted == MapBundle.open(of_whole[missing]).manifest.parameters["survey_scans"]
 
@@ -210,7 +218,7 @@ def test_a_rebuilt_block_is_replaced_in_every_tile_that_sees_it(
     update_tiled(whole, survey, tmp_path / "added")
     update_tiled(whole, survey, tmp_path / "replaced", replace_covered=True)
     assert damage_of(tmp_path / "replaced") == []
-    assert min(before) > 30
+    assert min(before) >= 20
     for was, added, replaced in zip(
         before, standing_in(tmp_path / "added", standing), standing_in(tmp_path / "replaced", standing), strict=True
     ):

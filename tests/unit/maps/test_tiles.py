@@ -16,6 +16,7 @@ from model_training.mapping.build import describe
 from model_training.mapping.calibration_file import renew_calibration
 from model_training.mapping.join import of_places
 from model_training.mapping.stored_map import content_of
+from model_training.mapping.tile_area import Square, TileArea, cloud_of_tile
 from model_training.stock import CALIBRATION
 from service.errors import BundleError
 from service.localization.localizer import Localizer
@@ -26,23 +27,36 @@ from service.maps.calibration import Site, read_calibration
 from service.maps.manifest import FileEntry, read_manifest
 from service.maps.reader import MapBundle
 from service.maps.tiled_writer import joined_site, write_tiled
-from service.maps.tiles import LocalTiles, OpenTiles, TiledMap, expected_next, in_order, open_map, served_bytes
+from service.maps.tiles import (
+    LocalTiles,
+    OpenTiles,
+    TiledMap,
+    expected_next,
+    in_order,
+    nearest_square,
+    open_map,
+    served_bytes,
+)
 from service.maps.writer import replace_calibration, write_bundle
-from service.registration.surfel_tiles import nearest_square
+from service.registration.surfel_map import SurfelMap
 from service.retrieval.prior import Prior
+from tests.unit.lattice import on_lattice
 
 TILE_M = 50.0
 
 
 def split(whole: Path, folder: Path, tile_m: float = TILE_M) -> dict[tuple[int, int], Path]:
-    """Return a bundle for each square; each has the whole cloud."""
+    """Return a bundle for each square, with the cloud that a built tile has."""
     opened = MapBundle.open(whole)
-    content = replace(content_of(opened), cloud=opened.cloud)
+    content, cloud = content_of(opened), opened.cloud
+    assert isinstance(cloud, SurfelMap)
     cells = np.floor(content.T_map_place[:, :2, 3] / tile_m).astype(int)
+    squares = [(column, row) for column, row in np.unique(cells, axis=0).tolist()]
     made = {}
-    for column, row in np.unique(cells, axis=0).tolist():
+    for column, row in squares:
         out = made[column, row] = folder / f"{column}_{row}"
-        write_bundle(out, of_places(content, (cells == (column, row)).all(axis=1)))
+        own = cloud_of_tile(cloud, TileArea(Square(column, row, tile_m), set(squares)))
+        write_bundle(out, replace(of_places(content, (cells == (column, row)).all(axis=1)), cloud=own))
     return made
 
 
@@ -55,6 +69,14 @@ def squares(stock_map: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[t
 def tiled_path(squares: dict[tuple[int, int], Path], tmp_path_factory: pytest.TempPathFactory) -> Path:
     out: Path = tmp_path_factory.mktemp("tiled") / "stock"
     write_tiled(out, squares, TILE_M, name="stock")
+    return out
+
+
+@pytest.fixture(scope="module")
+def whole_path(stock_map: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The map in one bundle. The lookup grid of its cloud begins where those of tiles begin, so its surfels are rounded alike."""
+    bundle, out = MapBundle.open(stock_map), tmp_path_factory.mktemp("whole") / "stock"
+    write_bundle(out, replace(content_of(bundle), cloud=on_lattice(bundle.cloud)))
     return out
 
 
@@ -82,9 +104,10 @@ def test_no_tile_is_open_before_a_query(tiled: TiledMap, stock_map: Path) -> Non
 
 
 def test_a_tiled_map_answers_as_the_same_map_in_one_bundle(
-    tiled: TiledMap, stock_map: Path, small_dataset: Any
+    tiled: TiledMap, whole_path: Path, small_dataset: Any
 ) -> None:
-    one, other = Localizer.open(MapBundle.open(stock_map)), Localizer.open(tiled)
+    """Although each tile has only its own part of the cloud."""
+    one, other = Localizer.open(MapBundle.open(whole_path)), Localizer.open(tiled)
     for query in queries_of(small_dataset, tiled):
         expected, found = one.localize(query), other.localize(query)
         assert found.status == expected.status
@@ -96,12 +119,12 @@ def test_a_tiled_map_answers_as_the_same_map_in_one_bundle(
         ]
 
 
-def test_frames_of_several_tiles_are_answered_together(tiled: TiledMap, stock_map: Path, small_dataset: Any) -> None:
+def test_frames_of_several_tiles_are_answered_together(tiled: TiledMap, whole_path: Path, small_dataset: Any) -> None:
     frames = list(small_dataset.queries("drive1_precise"))[:3]
     poses = [frame.T_map_camera for frame in frames]
     relative = tuple(np.linalg.inv(poses[0]) @ T for T in poses)
     asked = tuple(frame.query(tiled.grid) for frame in frames)
-    expected = Localizer.open(MapBundle.open(stock_map)).localize_frames(asked, relative)
+    expected = Localizer.open(MapBundle.open(whole_path)).localize_frames(asked, relative)
     found = Localizer.open(tiled).localize_frames(asked, relative)
     assert found.T_map_camera_guess == pytest.approx(expected.T_map_camera_guess, abs=1e-4)
 
@@ -113,7 +136,7 @@ def test_places_of_an_answer_are_numbers_of_the_whole_map(tiled: TiledMap, small
         assert tiled.place_street[each.place] == each.street
 
 
-def test_a_prior_opens_only_its_own_tile(tiled: TiledMap, small_dataset: Any) -> None:
+def test_a_prior_searches_only_its_own_tile(tiled: TiledMap, small_dataset: Any) -> None:
     frame = next(iter(small_dataset.queries("drive1_precise")))
     corner = tiled.tiles.squares_m[0, :2]
     query = replace(frame.query(tiled.grid), prior=Prior(position_m=corner - 40.0, position_std_m=1.0))
@@ -126,7 +149,10 @@ def test_a_prior_opens_only_its_own_tile(tiled: TiledMap, small_dataset: Any) ->
     again = TiledMap.open(tiled.path)
     query = replace(query, prior=Prior(position_m=corner - 30.0, position_std_m=1.0))
     Localizer.open(again).localize(query)
-    assert again.tiles.opened == (0,)
+    searched = again.searched(np.zeros(again.manifest.counts.descriptor_size, np.float32), (corner - 30.0, 54.0))
+    assert len(searched.places) == again.manifest.tiles[0].counts.places
+    around = again.tiles.near(searched.T_map_place[:, :2, 3], np.array([0]))  # their surfels are seen from its places
+    assert {0} < set(again.tiles.opened) <= set().union(*around)
 
 
 #: Nine squares of 500 m: columns -1 to 1, each with rows -1 to 1. Number 4 is the middle, 7 lies east of it and 5 north of it.

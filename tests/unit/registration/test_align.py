@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from service.geometry.rigid import rotation_x, rotation_y, rotation_z
-from service.registration.kernel import STATE, QueryPoints, SolverOptions, align, packed_map
+from service.registration.kernel import STATE, Piece, QueryPoints, SolverOptions, align, packed_map
 
 #: A fixture of two values: grid and surfels, or rotation and position.
 Pair = tuple[Any, Any]
@@ -26,7 +26,7 @@ def scored(cloud, points, states, **options):
     """Return the share of inliers of starts without solver iterations."""
     states = states.copy()
     still = SolverOptions(iterations=0, reach=1.2, robust_first=1.0, robust_last=1.0)
-    align(cloud.grid, cloud.surfels, points, states, still, **options)
+    align(cloud.pieces, points, states, still, **options)
     return states
 
 
@@ -56,7 +56,7 @@ def test_the_state_contains_how_the_solver_ended(street_map, seen, pose, start_a
     """After one step of a decimetre the solver has not converged. At the true pose it stops long before its last iteration."""
     states = start_at(pose[0], pose[1] + [away_m, 0.0, 0.0])
     options = SolverOptions(iterations=most, reach=1.2, robust_first=0.06, robust_last=0.06)
-    align(street_map.grid, street_map.surfels, seen, states, options)
+    align(street_map.pieces, seen, states, options)
     assert bool(states["converged"][0]) == converged
     assert (4 < states["iterations"][0] < most) if converged else states["iterations"][0] == 1
 
@@ -66,7 +66,7 @@ def test_the_error_is_half_the_weighted_squared_distance(street_map, points_at, 
     points = points_at([[0.0, 5.9, 0.0]], sigma=0.05)
     states = start_at(np.eye(3), np.array([0.0, 0.0, 1.5]))
     options = SolverOptions(iterations=1, reach=1.2, robust_first=1e6, robust_last=1e6, surface=0.0, prior_weight=1e9)
-    align(street_map.grid, street_map.surfels, points, states, options)
+    align(street_map.pieces, points, states, options)
     thickness_m, ratio = 0.01, 6.0 / 5.9  # the variance is taken where the ray meets the facade
     expected = 0.5 * 0.1**2 / (0.05**2 * ratio**3 + thickness_m**2)
     assert states["error"][0] == pytest.approx(expected, rel=1e-3)
@@ -114,7 +114,7 @@ def test_without_a_tolerance_all_but_the_score_is_the_same(street_map, seen, pos
     options = SolverOptions(iterations=5, reach=1.0, robust_first=0.5, robust_last=0.1)
     both = [start_at(turned(pose[0], yaw_deg=2), pose[1] + 0.1) for _ in range(2)]
     for states, tolerance_m in zip(both, (0.1, 0.0), strict=True):
-        align(street_map.grid, street_map.surfels, seen, states, options, tolerance_m=tolerance_m)
+        align(street_map.pieces, seen, states, options, tolerance_m=tolerance_m)
     for name in set(STATE.names or ()) - {"inliers", "weight"}:
         np.testing.assert_array_equal(both[0][name], both[1][name])
     assert both[0]["inliers"][0] > 0.5
@@ -144,7 +144,7 @@ ON_GROUND = [[1.0, 1, -1.5], [2, -2, -1.5], [-3, 1, -1.5], [0, 2, -1.5]]
 
 
 def share(plain: Pair, points, states, **options):
-    align(*plain, points, states, STILL, **options)
+    align((Piece(*plain),), points, states, STILL, **options)
     return float(states["inliers"][0])
 
 
@@ -223,7 +223,7 @@ def test_a_car_that_has_moved_by_half_a_metre_hardly_moves_the_pose(street_map, 
 def test_matched_is_the_weight_of_points_with_a_surfel(plain: Pair, points_at, start_at):
     points = points_at([*ON_GROUND, [1, 1, 4], [500, 0, 0]], weight=[1, 2, 3, 4, 50, 60])
     start = start_at(np.eye(3), [0, 0, 1.5])
-    align(*plain, points, start, SolverOptions(iterations=1, reach=1.2, robust_first=1.0, robust_last=1.0))
+    align((Piece(*plain),), points, start, SolverOptions(iterations=1, reach=1.2, robust_first=1.0, robust_last=1.0))
     assert start["matched"][0] == 10
 
 
@@ -232,7 +232,9 @@ def test_a_point_further_than_reach_from_its_surfel_is_left_out(plain: Pair, poi
     points = points_at(ON_GROUND)
     near, far = start_at(np.eye(3), [0, 0, 1.9]), start_at(np.eye(3), [0, 0, 2.1])
     for start in (near, far):
-        align(*plain, points, start, SolverOptions(iterations=1, reach=0.5, robust_first=1.0, robust_last=1.0))
+        align(
+            (Piece(*plain),), points, start, SolverOptions(iterations=1, reach=0.5, robust_first=1.0, robust_last=1.0)
+        )
     assert near["matched"][0] == 4
     assert far["matched"][0] == 0
 
@@ -259,7 +261,7 @@ def test_threads_do_not_disturb_each_other(street_map, seen, pose, start_at, set
 def test_no_points_move_nothing_and_score_zero(plain: Pair, points_at, start_at):
     start = start_at(rotation_y(0.1), [1, 2, 3], anchor=[0, 0, 0])
     found = start.copy()
-    align(*plain, points_at(np.zeros((0, 3))), found, SolverOptions(iterations=5, **PRIORS))
+    align((Piece(*plain),), points_at(np.zeros((0, 3))), found, SolverOptions(iterations=5, **PRIORS))
     np.testing.assert_array_equal(found["t"], start["t"])
     np.testing.assert_array_equal(found["R"], start["R"])
     assert found["inliers"][0] == 0
@@ -271,7 +273,7 @@ PRIORS: dict[str, Any] = {"reach": 1.0, "robust_first": 1.0, "robust_last": 1.0,
 
 def test_the_priors_alone_lead_to_the_anchor_without_scale_or_offset(plain: Pair, points_at, start_at):
     start = start_at(rotation_z(0.4), [3, -4, 2], log_scale=0.01, offset=0.2, anchor=[1, 2, 1.5])
-    align(*plain, points_at(LOST), start, SolverOptions(iterations=1, **PRIORS))
+    align((Piece(*plain),), points_at(LOST), start, SolverOptions(iterations=1, **PRIORS))
     np.testing.assert_allclose(start["t"][0], [1, 2, 1.5], atol=1e-9)
     np.testing.assert_allclose(start["R"][0], rotation_z(0.4), atol=1e-12)
     assert (start["log_scale"][0], start["offset"][0]) == pytest.approx((0, 0), abs=1e-12)
@@ -285,14 +287,14 @@ def test_the_priors_alone_stand_the_query_upright_on_the_ground(
     up = np.array(up) / np.linalg.norm(up)
     leaning = turned(rotation_z(0.7), roll_deg=roll_deg, pitch_deg=pitch_deg)
     start = start_at(leaning, [0, 0, 1.5], up=up)
-    align(*plain, points_at(LOST), start, SolverOptions(iterations=30, **PRIORS))
+    align((Piece(*plain),), points_at(LOST), start, SolverOptions(iterations=30, **PRIORS))
     np.testing.assert_allclose(start["R"][0][:, 2], up, atol=1e-6)
     assert np.arctan2(start["R"][0][1, 0], start["R"][0][0, 0]) == pytest.approx(0.7, abs=0.01)
 
 
 def test_a_step_turns_by_a_tenth_of_a_radian_at_most(plain: Pair, points_at, start_at):
     start = start_at(rotation_y(0.5), [0, 0, 1.5])
-    align(*plain, points_at(LOST), start, SolverOptions(iterations=1, **PRIORS))
+    align((Piece(*plain),), points_at(LOST), start, SolverOptions(iterations=1, **PRIORS))
     np.testing.assert_allclose(start["R"][0], rotation_y(0.4), atol=1e-9)
 
 
@@ -302,7 +304,7 @@ def test_points_outweigh_the_height_prior(plain: Pair, points_at, start_at):
     points = points_at(np.c_[rng.uniform(-4, 4, (200, 2)), np.full(200, -1.5)], sigma=0.0)
     start = start_at(np.eye(3), [0, 0, 1.7])
     align(
-        *plain,
+        (Piece(*plain),),
         points,
         start,
         SolverOptions(iterations=30, reach=1.2, robust_first=1.0, robust_last=1.0, free_scale=False),

@@ -39,7 +39,7 @@ def solved(street_map, pose, start_at):
 
     def solve(points, options):
         state = start_at(rotation_z(0.03) @ pose[0], pose[1] + [0.2, -0.1, 0.05], log_scale=0.002, offset=0.05)
-        align(street_map.grid, street_map.surfels, points, state, options, tolerance_m=0.15, height_min_m=-1.2)
+        align(street_map.pieces, points, state, options, tolerance_m=0.15, height_min_m=-1.2)
         return state[0]
 
     return solve
@@ -88,7 +88,7 @@ def test_the_gradient_of_points_is_the_sum_of_single_gradients(mixed, street_map
 
     def pulled(rows):
         patch = np.arange(len(rows), dtype=np.int32)
-        return gradients(street_map.grid, street_map.surfels, mixed.subset(rows), start, ONE_STEP, patch)
+        return gradients(street_map.pieces, mixed.subset(rows), start, ONE_STEP, patch)
 
     alone = np.concatenate([pulled(np.array([k])) for k in range(count)])
     np.testing.assert_array_equal(pulled(np.arange(count)), alone)

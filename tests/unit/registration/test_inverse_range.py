@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from service.geometry.rigid import rotation_z
-from service.registration.kernel import SURFEL, SolverOptions, align, packed_map
+from service.registration.kernel import SURFEL, Piece, SolverOptions, align, packed_map
 
 #: A fixture of two values: grid and surfels, or rotation and position.
 Pair = tuple[Any, Any]
@@ -28,7 +28,7 @@ def one_surfel():
 
 def known(one_surfel: Pair, points, start, **options):
     """Return the information about x after one iteration."""
-    align(*one_surfel, points, start, SolverOptions(**(FREE | options), iterations=1))
+    align((Piece(*one_surfel),), points, start, SolverOptions(**(FREE | options), iterations=1))
     return start["information"][0, 0, 0]
 
 
@@ -116,7 +116,7 @@ def test_noise_that_is_even_in_inverse_range_draws_no_wall_nearer(
     turned = packed_map(surfels, cell_m=0.4, reach_m=1.2)[:2]
     start = start_at(R, R @ [off_m - distance_m, 0, 0])
     options = SolverOptions(**(FREE | {"prior_weight": 1e-6}), iterations=10, free_scale=False)
-    align(*turned, seen_twice(points_at, distance_m, error), start, options)
+    align((Piece(*turned),), seen_twice(points_at, distance_m, error), start, options)
     too_far_ahead = float(R[:, 0] @ start["t"][0]) + distance_m
     bias = drawn_nearer_m(distance_m, error)
     assert bias > 0.01
@@ -130,5 +130,5 @@ def test_a_narrow_robust_kernel_damps_both_signs_of_the_noise_equally(wall: Pair
     kernel = {"robust_first": 1e-3, "robust_last": 1e-3, "prior_weight": 1e-6}
     options = SolverOptions(**(FREE | kernel), iterations=30, free_scale=False)
     error = 0.8 * 0.02 * distance_m
-    align(*wall, seen_twice(points_at, distance_m, error), start, options)
+    align((Piece(*wall),), seen_twice(points_at, distance_m, error), start, options)
     assert abs(float(start["t"][0][0]) + distance_m) < 0.05 * drawn_nearer_m(distance_m, error)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from service.registration.kernel import SURFEL, QueryPoints, SolverOptions, align, gradients, packed_map
+from service.registration.kernel import SURFEL, Piece, QueryPoints, SolverOptions, align, gradients, packed_map
 
 UNKNOWNS = ["x", "y", "z", "roll", "pitch", "yaw", "log scale", "disparity offset"]
 FREE: dict[str, Any] = {"reach": 1.0, "robust_first": 1e6, "robust_last": 1e6, "prior_weight": 0.0, "free_offset": True}
@@ -70,7 +70,7 @@ class Problem:
 
     def aligned(self, start_at, *, change=None, **options):
         state = self.state(start_at, change=change)
-        align(self.grid, self.packed, self.points, state, SolverOptions(**(FREE | options)))
+        align((Piece(self.grid, self.packed),), self.points, state, SolverOptions(**(FREE | options)))
         return state[0]
 
     def away(self, state):
@@ -114,7 +114,7 @@ def test_the_gradient_of_a_patch_equals_the_numerical_one(start_at, seed):
     expected = np.stack([each[patch == number].sum(axis=0) for number in range(8)])
     state, options = problem.state(start_at), SolverOptions(**FREE, iterations=1, surface=0.05)
     before = state.tobytes()
-    found = gradients(problem.grid, problem.packed, problem.points, state, options, patch)
+    found = gradients((Piece(problem.grid, problem.packed),), problem.points, state, options, patch)
     size = np.abs(each).sum(axis=0)
     np.testing.assert_allclose(found / size, expected / size, atol=1e-5)
     assert (found[6] == 0).all()
@@ -129,7 +129,7 @@ def test_the_sum_of_the_gradients_gives_the_solver_step(start_at, seed):
     state, options = problem.state(start_at), SolverOptions(**FREE, iterations=1, surface=0.05)
     count = len(problem.surfels)
     found = gradients(
-        problem.grid, problem.packed, problem.points, state, options, np.arange(count, dtype=np.int32) % 9
+        (Piece(problem.grid, problem.packed),), problem.points, state, options, np.arange(count, dtype=np.int32) % 9
     )
     moved = problem.aligned(start_at, iterations=1, surface=0.05)
     damping = np.diag([0, 0, 0, *[1e-3 * problem.points.weight.sum()] * 3, 0, 0])
@@ -167,5 +167,5 @@ def test_a_point_off_its_surface_informs_the_less_the_narrower_the_robust_width(
     grid, packed, _ = packed_map(surfels, cell_m=0.3, reach_m=1.2)
     state = start_at(np.eye(3), [-5, 0, 0])
     options = SolverOptions(**(FREE | {"robust_first": robust_m, "robust_last": robust_m}), iterations=1, surface=0.1)
-    align(grid, packed, points_at([[5.1, 0, 0]], sigma=0.0), state, options)
+    align((Piece(grid, packed),), points_at([[5.1, 0, 0]], sigma=0.0), state, options)
     assert state["information"][0, 0, 0] == pytest.approx(expected, rel=1e-4)

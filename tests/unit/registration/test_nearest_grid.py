@@ -10,7 +10,7 @@ from scipy.spatial import cKDTree
 from benchmarks.native.plain import surfels_of_cells
 from service.errors import StreetfixError
 from service.registration import kernel
-from service.registration.kernel import BLOCK, REGION, SURFEL, packed_map
+from service.registration.kernel import BLOCK, PACKED_SURFEL, REGION, SURFEL, Piece, packed_map
 
 #: Shares of a random map: surfels in one heap, in two heaps a region apart, and in two towns 60 km apart.
 APART_M = [0.0, 30.0, 60_000.0]
@@ -26,6 +26,10 @@ def mapped(surfels, *, cell_m, reach_m):
     """Return the grid of a map and the positions of its surfels, in the order of the map."""
     grid, packed, _ = packed_map(surfels, cell_m=cell_m, reach_m=reach_m)
     return grid, grid.unpacked(packed, np.arange(len(packed)))
+
+
+def held_at(grid, positions):
+    return kernel.surfels_at((Piece(grid, np.zeros(0, PACKED_SURFEL)),), positions)
 
 
 def cells_around(grid, surfels, reach_m):
@@ -72,7 +76,7 @@ def test_every_cell_holds_the_surfel_that_a_dense_grid_holds(seed, count, cell_m
     cells = cells_around(grid, surfels, reach_m)
     expected = dense_grid(surfels, cells, grid, reach_m)
     centres = grid.origin_m + (cells + 0.5) * cell_m
-    np.testing.assert_array_equal(grid.surfels_at(centres), expected)
+    np.testing.assert_array_equal(held_at(grid, centres), expected)
     np.testing.assert_array_equal(surfels_of_cells(grid, cells), expected)
     assert len(grid.nearest) == (expected >= 0).sum()  # and no cell outside these boxes is filled
 
@@ -86,7 +90,7 @@ def test_every_cell_within_reach_holds_its_nearest_surfel_and_every_other_none(
     grid, surfels = mapped(surfels, cell_m=cell_m, reach_m=reach_m)
     cells = cells_around(grid, surfels, reach_m)
     centres = grid.origin_m + (cells + 0.5) * cell_m
-    found = grid.surfels_at(centres)
+    found = held_at(grid, centres)
     xyz = surfels["xyz"].astype(np.float64)
     tree: Any = cKDTree(xyz)
     distance, _ = tree.query(centres)
@@ -101,9 +105,9 @@ def test_a_position_outside_the_grid_has_no_surfel(value):
     surfels = surfels_at(np.random.default_rng(1).uniform(0, 3, (40, 3)))
     grid, surfels = mapped(surfels, cell_m=0.4, reach_m=1.2)
     inside = np.tile(surfels["xyz"][:1].astype(np.float64), (3, 1))
-    assert (grid.surfels_at(inside) >= 0).all()
+    assert (held_at(grid, inside) >= 0).all()
     np.fill_diagonal(inside, grid.origin_m + value)
-    np.testing.assert_array_equal(grid.surfels_at(inside), -1)
+    np.testing.assert_array_equal(held_at(grid, inside), -1)
 
 
 def test_positions_of_many_regions_alternate():
@@ -113,7 +117,7 @@ def test_positions_of_many_regions_alternate():
     grid, _ = mapped(surfels, cell_m=0.5, reach_m=1.0)
     order = np.random.default_rng(0).integers(-1, 6, 1000)
     expected = np.where((order >= 0) & (order < 5), order, -1)
-    np.testing.assert_array_equal(grid.surfels_at(np.c_[order * step, np.zeros((1000, 2))]), expected)
+    np.testing.assert_array_equal(held_at(grid, np.c_[order * step, np.zeros((1000, 2))]), expected)
 
 
 def bytes_of(grid):

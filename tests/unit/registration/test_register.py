@@ -226,7 +226,7 @@ def test_the_middle_stage_moves_the_starts_by_its_own_options_and_points(surveye
     found = register(surveyed, seen, [moved], HEIGHT_M, settings)[0]
     few = seen.subset(np.linspace(0, len(seen) - 1, 101).astype(np.intp))
     state = start_at(moved.R_map_level, moved.camera_m - surveyed.origin_m)
-    align(surveyed.grid, surveyed.surfels, few, state, options)
+    align(surveyed.pieces, few, state, options)
     np.testing.assert_allclose(found.camera_m - surveyed.origin_m, state["t"][0], atol=1e-12)
     np.testing.assert_allclose(found.R_map_level, state["R"][0], atol=1e-12)
     assert np.linalg.norm(found.camera_m - moved.camera_m) > 0.2
@@ -245,12 +245,11 @@ def test_the_fine_stage_lets_no_point_weigh_too_little_but_the_score_is_by_their
     moved = start(*pose, 0, moved_m=(0.3, 0.2, 0.0))
     found = register(surveyed, points, [moved], HEIGHT_M, settings)[0]
     state = start_at(moved.R_map_level, moved.camera_m - surveyed.origin_m)
-    align(surveyed.grid, surveyed.surfels, raised, state, options)
+    align(surveyed.pieces, raised, state, options)
     np.testing.assert_allclose(found.camera_m - surveyed.origin_m, state["t"][0], atol=1e-12)
     np.testing.assert_allclose(found.information, state["information"][0], rtol=1e-9)
     align(
-        surveyed.grid,
-        surveyed.surfels,
+        surveyed.pieces,
         points,
         state,
         STILL,

@@ -6,7 +6,7 @@ from scipy.spatial.transform import Rotation
 
 from service.geometry.camera import PinholeCamera
 from service.geometry.rigid import R_BODY_OPTICAL, rotation_z, transform_from
-from service.registration.kernel import SURFEL, NearestGrid, packed_map, render
+from service.registration.kernel import SURFEL, NearestGrid, Piece, packed_map, render
 
 CAMERA = PinholeCamera(32, 24, 20.0, 20.0, 15.5, 11.5)
 AHEAD = transform_from(R_BODY_OPTICAL, np.zeros(3))
@@ -23,7 +23,7 @@ def wall(x, *, y=(-20, 20), z=(-20, 20), step=0.1):
 
 def drawn(*walls, T=AHEAD, reach_m=40.0):
     grid, surfels, _ = packed_map(np.concatenate(walls), cell_m=0.4, reach_m=1.2)
-    return render(grid, surfels, T_map_camera=T, camera=CAMERA, size_m=0.12, reach_m=reach_m)
+    return render((Piece(grid, surfels),), T_map_camera=T, camera=CAMERA, size_m=0.12, reach_m=reach_m)
 
 
 def test_a_wall_that_fills_the_view_stands_at_its_distance_in_every_pixel():
@@ -103,7 +103,7 @@ def test_regions_that_are_left_out_have_nothing_to_draw(seed, heading, pitch, ro
     R = Rotation.from_euler("zyx", [heading, pitch, roll], degrees=True).as_matrix() @ R_BODY_OPTICAL
     T = transform_from(R, rng.uniform(-20, 20, 3))
     grid, surfels, _ = packed_map(np.concatenate(walls), cell_m=0.4, reach_m=1.2)
-    found = render(grid, surfels, T_map_camera=T, camera=camera, size_m=1.0, reach_m=40.0)
+    found = render((Piece(grid, surfels),), T_map_camera=T, camera=camera, size_m=1.0, reach_m=40.0)
     expected = slowly_drawn(grid, surfels, T, camera, size_m=1.0, reach_m=40.0)
     assert (np.abs(found - expected) > 0.01).sum() <= 2  # single precision at the border of a square
 
@@ -113,5 +113,5 @@ def test_a_map_without_regions_draws_an_empty_picture():
     empty = NearestGrid(
         grid.origin_m, grid.cell_m, grid.slots, grid.regions[:0], grid.blocks[:0], grid.nearest[:0], grid.others
     )
-    found = render(empty, surfels[:0], T_map_camera=AHEAD, camera=CAMERA, size_m=0.1, reach_m=40.0)
+    found = render((Piece(empty, surfels[:0]),), T_map_camera=AHEAD, camera=CAMERA, size_m=0.1, reach_m=40.0)
     np.testing.assert_array_equal(found, np.zeros((24, 32)))

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from scipy.spatial import cKDTree
 
 from service.errors import BundleError, StreetfixError
-from service.registration.kernel import PACKED_SURFEL, SURFEL, SolverOptions, align, packed_map
+from service.registration.kernel import PACKED_SURFEL, SURFEL, SolverOptions, align, packed_map, surfels_at
 from service.registration.surfel_map import SurfelMap
 
 REQUIRED = [
@@ -57,7 +57,7 @@ def test_memory_mapped_arrays_register_like_those_in_memory(cloud, tmp_path, poi
     options = SolverOptions(iterations=5, reach=1.2, robust_first=1.0, robust_last=0.1)
     states = [start_at(np.eye(3), [1.5, 1.5, 1.6]) for _ in range(2)]
     for each, state in zip((cloud, mapped), states, strict=True):
-        align(each.grid, each.surfels, points, state, options)
+        align(each.pieces, points, state, options)
     assert states[0].tobytes() == states[1].tobytes()
     assert states[0]["inliers"][0] > 0.9
 
@@ -67,7 +67,7 @@ def test_the_grid_reaches_12_decimetres_from_a_surface(cloud, points_at, start_a
     """A cell of 0.4 m is inside or outside by its centre: 1.2 m, plus or minus half a cell."""
     once = SolverOptions(iterations=1, reach=5.0, robust_first=1.0, robust_last=1.0)
     state = start_at(np.eye(3), [1.5, 1.5, above_m - 1.0])
-    align(cloud.grid, cloud.surfels, points_at([[0, 0, 1.0]]), state, once)
+    align(cloud.pieces, points_at([[0, 0, 1.0]]), state, once)
     assert state["matched"][0] == seen
 
 
@@ -260,7 +260,7 @@ def test_a_region_with_many_surfels_numbers_them_in_four_bytes():
     xyz = cloud.unpacked(np.s_[:])["xyz"]
     tree: Any = cKDTree(xyz)
     distance, _ = tree.query(centres)
-    rows = grid.surfels_at(centres)
+    rows = surfels_at(cloud.pieces, centres)
     assert (rows > 1 << 16).any()
     np.testing.assert_allclose(np.linalg.norm(xyz[rows] - centres, axis=1), distance, atol=1e-5)
 

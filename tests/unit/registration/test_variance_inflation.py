@@ -93,7 +93,7 @@ def by_patch(city, points, start, options):
     """Return the gradient of each patch, computed separately."""
     number = patches(points.ray)
     parts = [points.subset(np.flatnonzero(number == each)) for each in range(number.max() + 1)]
-    return [gradients(city.grid, city.surfels, p, start, options, np.zeros(len(p), np.int32))[0] for p in parts]
+    return [gradients(city.pieces, p, start, options, np.zeros(len(p), np.int32))[0] for p in parts]
 
 
 @given(st.integers(0, 10**6), st.integers(1, 400), st.floats(0.97, 1.03), st.floats(-0.2, 0.2))
@@ -200,7 +200,7 @@ def mean_scatter(wall, taken, fan):
 def information(wall, taken, start_at):
     """Return the information of the same points."""
     start = start_at(np.eye(3), [-3.0, 0, 0])
-    align(wall.grid, wall.surfels, taken(np.random.default_rng(8)), start, replace(PLAIN.fine, iterations=1))
+    align(wall.pieces, taken(np.random.default_rng(8)), start, replace(PLAIN.fine, iterations=1))
     return start["information"][0]
 
 

@@ -110,9 +110,7 @@ def told(cloud, rgb, T_map_camera):
     T = T_map_camera.copy()
     T[:3, 3] -= cloud.origin_m
     grey = grey_of(rgb, CAMERA, (1.0, 1.0), PATCHES)
-    return agreement_of_brightness(
-        cloud.brightness, SurfelRaycaster(cloud, DiscSettings()).intersect(T, CAMERA), grey, PATCHES
-    )
+    return agreement_of_brightness(cloud, SurfelRaycaster(cloud, DiscSettings()).intersect(T, CAMERA), grey, PATCHES)
 
 
 @pytest.mark.parametrize("aside_m", [-3.0, -1.0, -0.5, 0.5, 1.0, 3.0])
