@@ -14,13 +14,14 @@ from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
-from jaxtyping import Bool, Float32, Float64, Int8, Int32, Int64
+from jaxtyping import Bool, Float32, Float64, Int32, Int64
 from numpy.typing import NDArray
 
 from service.errors import BundleError, damaged_file
 from service.maps import content as parts
 from service.maps import inverted_file, manifest, streets
 from service.maps.ahead import Ahead
+from service.maps.around import nearest_square, ranks_of_regions, tiles_around
 from service.maps.calibration import read_calibration
 from service.maps.checked_tiles import Checked, CheckedTiles, mark_of
 from service.maps.files import map_array, read_file, require_files
@@ -31,16 +32,8 @@ from service.maps.manifest import FileEntry, Manifest, Tile, read_manifest
 from service.maps.map import Map
 from service.maps.reader import MapBundle, read_streets
 from service.maps.streets import Streets, StreetsFile
-from service.registration.surfel_map import REGION_M, SurfelMap
-from service.registration.surfel_tiles import (
-    AROUND_M,
-    JoinedSurfels,
-    Surfels,
-    SurfelTiles,
-    columns_of_regions,
-    lies_on_lattice,
-    numbers_in_map,
-)
+from service.registration.surfel_map import SurfelMap
+from service.registration.surfel_tiles import JoinedSurfels, Surfels, SurfelTiles, lies_on_lattice
 
 #: Largest number of tiles that are searched for one query. A map of more tiles needs a search index, which chooses them.
 MOST_SEARCHED = 6
@@ -366,17 +359,7 @@ class OpenTiles:
             among: numbers of the tiles that a query uses.
         """
         first = among[nearest_square(self.squares_m[among], xy_m)]
-        of_low, of_high = (
-            columns_of_regions(np.floor((xy_m + side) / REGION_M).astype(np.int64), self._tile_m)
-            for side in (-AROUND_M, AROUND_M)
-        )
-        found: dict[tuple[int, ...], tuple[int, ...]] = {}
-        keys = [tuple(row) for row in np.column_stack([first, of_low, of_high]).tolist()]
-        for key in dict.fromkeys(keys):
-            own, x0, y0, x1, y1 = key
-            around = (self._number.get((x, y)) for x in range(x0, x1 + 1) for y in range(y0, y1 + 1))
-            found[key] = (own, *(number for number in around if number is not None and number != own))
-        return [found[key] for key in keys]
+        return tiles_around(self._number, self._tile_m, xy_m, first)
 
     def surfels_of(self, numbers: tuple[int, ...]) -> Surfels:
         """Return the surfels of some tiles together. They are kept as long as all of these tiles are open.
@@ -399,7 +382,9 @@ class OpenTiles:
         opened = dict(zip(numbers, self.get_all(numbers), strict=True))
         self._cloud_of(numbers[0], opened[numbers[0]])
         clouds = {number: bundle.cloud for number, bundle in opened.items() if isinstance(bundle.cloud, SurfelMap)}
-        made = JoinedSurfels.of(list(clouds.values()), [self._ranks(*each) for each in clouds.items()])
+        tiles, edge_m = self._manifest.tiles, self._tile_m
+        ranks = [ranks_of_regions(cloud, tiles[number], edge_m) for number, cloud in clouds.items()]
+        made = JoinedSurfels.of(list(clouds.values()), ranks)
         with self._changing:
             if all(number in self._opened for number in numbers):
                 self._joined[numbers] = made
@@ -411,17 +396,6 @@ class OpenTiles:
         if not isinstance(bundle.cloud, SurfelMap):
             raise damaged_file(self._path / self._manifest.tiles[number].folder, "the tile has no cloud")
         return bundle.cloud
-
-    def _ranks(self, number: int, cloud: SurfelMap) -> Int8[NDArray[np.int8], " R"]:
-        """Return which regions a tile gives to the map: 2 for its own, 1 for those that it has and does not own, 0 for those without cells.
-
-        A tile has regions of squares without a tile. A merged map may have tiles there.
-        """
-        tile, grid = self._manifest.tiles[number], cloud.grid
-        owners = columns_of_regions(numbers_in_map(cloud)[:, :2], self._tile_m)
-        is_own = (owners == (tile.column, tile.row)).all(axis=1)
-        has_cells = np.diff(grid.regions["block"], append=len(grid.blocks)) > 0
-        return np.where(is_own, np.int8(2), has_cells.astype(np.int8))
 
     def _prepare(self, number: int) -> None:
         """Fetch and check a tile, and open it if there is room."""
@@ -835,21 +809,6 @@ def in_order(numbers: Int64[NDArray[np.int64], " n"]) -> Int64[NDArray[np.int64]
     """
     _, first = np.unique(numbers, return_index=True)
     return numbers[np.sort(first)]
-
-
-def nearest_square(
-    squares_m: Float64[NDArray[np.float64], "T 4"], xy_m: Float64[NDArray[np.float64], "n 2"]
-) -> Int64[NDArray[np.int64], " n"]:
-    """Return the row of the square that holds each position, or of the nearest square.
-
-    Args:
-        squares_m: x0, y0, x1, y1 of each square, m.
-        xy_m: positions, m.
-    """
-    low, high = squares_m[None, :, :2] - xy_m[:, None], xy_m[:, None] - squares_m[None, :, 2:]
-    away = np.linalg.norm(np.maximum(np.maximum(low, high), 0.0), axis=2)
-    nearest: Int64[NDArray[np.int64], " n"] = away.argmin(axis=1)
-    return nearest
 
 
 def _away_m(

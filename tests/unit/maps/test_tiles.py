@@ -23,6 +23,7 @@ from service.localization.localizer import Localizer
 from service.maps import files, inverted_file
 from service.maps import tiles as tiles_module
 from service.maps.ahead import Ahead
+from service.maps.around import nearest_square
 from service.maps.calibration import Site, read_calibration
 from service.maps.manifest import FileEntry, read_manifest
 from service.maps.reader import MapBundle
@@ -33,7 +34,6 @@ from service.maps.tiles import (
     TiledMap,
     expected_next,
     in_order,
-    nearest_square,
     open_map,
     served_bytes,
 )
@@ -594,10 +594,7 @@ def test_the_site_check_of_a_map_is_the_mean_over_the_queries_of_its_tiles() -> 
     assert joined_site([]) is None
 
 
-def test_the_nearest_square_of_a_position() -> None:
-    squares_m = np.array([[0.0, 0.0, 50.0, 50.0], [50.0, 0.0, 100.0, 50.0]])
-    xy = np.array([[10.0, 10.0], [60.0, 49.0], [-5.0, 200.0], [120.0, -7.0]])
-    assert nearest_square(squares_m, xy).tolist() == [0, 1, 0, 1]
+def test_numbers_in_the_order_of_their_first_occurrence() -> None:
     assert in_order(np.array([3, 1, 3, 0, 1])).tolist() == [3, 1, 0]
 
 
