@@ -4,7 +4,7 @@ The lookup grids of all tiles lie on one lattice of regions (``surfel_map.REGION
 square. Its cloud has
 
 - the regions that it owns,
-- regions of squares without a tile, up to ``TILE_MARGIN_M`` beyond its square, because no other tile has them,
+- the regions of squares without a tile that begin within ``TILE_MARGIN_M`` of its square, because no tile owns them,
 - and ``OVERLAP_M`` more on all sides, because a cell at the edge of a region may be nearest to a surfel behind the edge.
 
 A query near an edge uses the clouds of all tiles around it (decision 0199).
@@ -51,11 +51,13 @@ class Square:
             margin_m: margin on all four sides, metres.
             positions: metres, map frame (n, 2) or (n, 3).
         """
-        low, high = (
-            np.array([self.column, self.row]) * self.tile_m,
-            np.array([self.column + 1, self.row + 1]) * self.tile_m,
-        )
-        return _Box(*(low - margin_m), *(high + margin_m)).contains(positions)
+        return self.ground.wider(margin_m).contains(positions)
+
+    @property
+    def ground(self) -> "_Box":
+        """The square itself."""
+        x0, y0, x1, y1 = (number * self.tile_m for number in (self.column, self.row, self.column + 1, self.row + 1))
+        return _Box(x0, y0, x1, y1)
 
     @property
     def regions(self) -> "_Box":
@@ -84,6 +86,14 @@ class _Box:
     def within(self, other: "_Box") -> "_Box":
         return _Box(max(self.x0, other.x0), max(self.y0, other.y0), min(self.x1, other.x1), min(self.y1, other.y1))
 
+    def in_whole_regions(self) -> "_Box":
+        """Return the smallest rectangle of whole regions around this one."""
+        low, high = (
+            (math.floor(each / REGION_M) * REGION_M for each in (self.x0, self.y0)),
+            (math.ceil(each / REGION_M) * REGION_M for each in (self.x1, self.y1)),
+        )
+        return _Box(*low, *high)
+
     def away_m(self, positions: NDArray[np.float64]) -> NDArray[np.float64]:
         """Distances along x and y of positions (n, 2 or more) from the rectangle (n, 2); 0 inside."""
         x, y = positions[:, 0], positions[:, 1]
@@ -105,7 +115,7 @@ class TileArea:
 
     def __init__(self, square: Square, squares: Set[tuple[int, int]]) -> None:
         self.square = square
-        reach = math.ceil((TILE_MARGIN_M + REGION_M) / square.tile_m)
+        reach = math.ceil((TILE_MARGIN_M + 2 * REGION_M) / square.tile_m)
         around = [
             Square(square.column + x, square.row + y, square.tile_m)
             for x in range(-reach, reach + 1)
@@ -115,14 +125,11 @@ class TileArea:
         others = [each for each in around if (each.column, each.row) in squares]
         self.beside = tuple(sorted((each.column, each.row) for each in others))
         self._others = tuple(each.regions for each in others)
-        edge_m = square.tile_m
-        low_m, high_m = (
-            np.array([square.column, square.row]) * edge_m,
-            np.array([square.column + 1, square.row + 1]) * edge_m,
-        )
-        whole = _Box(*low_m.tolist(), *high_m.tolist()).wider(TILE_MARGIN_M)
-        free = (each.regions.wider(OVERLAP_M).within(whole) for each in around if each not in others)
-        self._boxes = (square.regions.wider(OVERLAP_M), *(box for box in free if box.x0 < box.x1 and box.y0 < box.y1))
+        # Whole regions, so that all tiles with a region have all of it.
+        self._reached = square.ground.wider(TILE_MARGIN_M).in_whole_regions()
+        free = (each.regions.within(self._reached) for each in around if each not in others)
+        boxes = (square.regions, *(box for box in free if box.x0 < box.x1 and box.y0 < box.y1))
+        self._boxes = tuple(box.wider(OVERLAP_M) for box in boxes)
 
     def is_in_cloud(self, positions: NDArray[np.float64]) -> NDArray[np.bool_]:
         """Return whether the cloud of the tile has each point (n,).
@@ -154,7 +161,8 @@ class TileArea:
         """
         owners = columns_of_regions(np.floor(centres[:, :2] / REGION_M).astype(np.int64), self.square.tile_m)
         others = set(self.beside)
-        return np.array([owner not in others for owner in map(tuple, owners.tolist())], np.bool_)
+        is_free = np.array([owner not in others for owner in map(tuple, owners.tolist())], np.bool_)
+        return np.asarray(is_free & (self.square.regions.contains(centres) | self._reached.contains(centres)))
 
     def surrounds(self, positions: NDArray[np.float64]) -> NDArray[np.bool_]:
         """Return whether the cloud of the tile alone has all surfaces up to ``SURROUNDING_M`` around each position of its square (n,).

@@ -48,9 +48,9 @@ def test_both_maps_have_the_same_city_and_no_tile_has_two(made: Any, stock_map: 
     assert one.counts.places == places
     assert many.counts.places == 4 * places
     assert len(many.tiles) == 4 * len(one.tiles) > 4
-    of_one = {(tile.column, tile.row): tile.counts for tile in one.tiles}
-    of_many = {(tile.column, tile.row): tile.counts for tile in many.tiles}
-    shifted = {(c + x, r + y): counts for (c, r), counts in of_one.items() for x in (0, 6) for y in (0, 6)}
+    of_one = {(tile.column, tile.row): tile.counts.places for tile in one.tiles}
+    of_many = {(tile.column, tile.row): tile.counts.places for tile in many.tiles}
+    shifted = {(c + x, r + y): places for (c, r), places in of_one.items() for x in (0, 6) for y in (0, 6)}
     assert of_many == shifted
 
 

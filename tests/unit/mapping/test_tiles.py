@@ -64,17 +64,40 @@ def test_a_tile_reads_the_scans_that_measure_its_cloud_only():
 
 
 def test_a_tile_without_a_neighbour_reads_further():
-    """Nobody drove in the square from 50 to 100 m. So the cloud of the first tile ends at 100 m, and its last scan stands before 140 m."""
-    found = parts_of([(25.0, 25.0), (139.9, 25.0), (140.1, 25.0)], tile_m=50.0)
+    """Nobody drove in the square from 50 to 100 m. Its regions end at 102.4 m, and 1.6 m and 40 m more are 144 m."""
+    found = parts_of([(25.0, 25.0), (143.9, 25.0), (144.1, 25.0)], tile_m=50.0)
     assert sorted(found) == [(0, 0), (2, 0)]
     assert found[0, 0].order.tolist() == [0, 1]
 
 
 def test_the_cloud_reaches_what_a_camera_at_the_edge_sees():
-    part = parts_of([(50.0, 50.0)])[0, 0]
-    points = np.array([[149.9, 50.0, 3.0], [150.1, 50.0, 3.0], [-50.0, -50.0, 0.0], [50.0, -50.1, 0.0]])
-    assert part.area.is_in_cloud(points).tolist() == [True, False, True, False]
+    """50 m beyond the square lies the region from 128 to 153.6 m, or from -51.2 m. The cloud has all of it, and 1.6 m more."""
+    area = parts_of([(50.0, 50.0)])[0, 0].area
+    points = np.array([[155.1, 50.0, 3.0], [155.3, 50.0, 3.0], [-52.7, -52.7, 0.0], [50.0, -52.9, 0.0]])
+    assert area.is_in_cloud(points).tolist() == [True, False, True, False]
     assert max(MAX_RANGE_M, REACH_M) < TILE_MARGIN_M < SCANS_MARGIN_M
+    centres = 25.6 * (np.array([[5, 1, 0], [6, 1, 0], [-2, -2, 0], [-3, 1, 0]]) + 0.5)
+    assert area.has_cells(centres).tolist() == [True, False, True, False]
+
+
+def test_tiles_divide_the_regions_between_them():
+    """Region 4 has its centre at 115.2 m, in the second square. The first tile only has 1.6 m of it, without cells."""
+    found = parts_of([(50.0, 50.0), (150.0, 50.0)])
+    first, second = found[0, 0].area, found[1, 0].area
+    assert (first.beside, second.beside) == (((1, 0),), ((0, 0),))
+    points = np.array([[x, 50.0, 0.0] for x in (100.7, 103.9, 104.1)])
+    assert first.is_in_cloud(points).tolist() == [True, True, False]
+    assert second.is_in_cloud(points).tolist() == [False, True, True]
+    centres = 25.6 * (np.array([[3, 1, 0], [4, 1, 0]]) + 0.5)
+    assert first.has_cells(centres).tolist() == [True, False]
+    assert second.has_cells(centres).tolist() == [False, True]
+
+
+def test_a_place_is_surrounded_if_no_other_tile_has_a_surface_within_45_m():
+    """The regions of the second tile begin at 102.4 m, and the first tile has 1.6 m of them."""
+    area = parts_of([(50.0, 50.0), (150.0, 50.0)])[0, 0].area
+    places = np.array([[58.9, 50.0], [59.1, 50.0], [1.0, 99.0]])
+    assert area.surrounds(places).tolist() == [True, False, True]
 
 
 def test_a_place_between_scans_is_in_the_square_of_its_position():
