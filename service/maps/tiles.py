@@ -53,8 +53,6 @@ LEAST_STEP_M = 0.05
 PREPARE_EVERY_S = 10.0
 #: Largest number of regions that are kept, each put together from several tiles.
 MOST_REGIONS = 16
-#: Largest number of joined clouds that are kept. Each takes 64 bytes for each region of its tiles.
-MOST_JOINED = 64
 _NEEDED = (parts.ENCODER_FILE, parts.PLACES_FILE, parts.CALIBRATION_FILE)
 
 
@@ -201,7 +199,6 @@ class OpenTiles:
         self._prepared_s: dict[int, float] = {}
         self._opened: OrderedDict[int, MapBundle] = OrderedDict()
         self._regions: dict[tuple[int, ...], Map] = {}
-        self._joined: OrderedDict[tuple[int, ...], JoinedSurfels] = OrderedDict()
         self._changing = threading.Lock()
         self._opening: defaultdict[int, threading.Lock] = defaultdict(threading.Lock)
         corners = np.array(
@@ -301,7 +298,7 @@ class OpenTiles:
             self._ahead.expect(closed, is_ordered=before_m is not None)
 
     def region(self, numbers: tuple[int, ...], make: Callable[[tuple[int, ...]], Map]) -> Map:
-        """Return the parts of some tiles together. They are kept as long as all of these tiles are open.
+        """Return the parts of some tiles together. They are kept as long as all of these tiles and those around them are open.
 
         Args:
             numbers: numbers of the tiles, ascending.
@@ -310,7 +307,7 @@ class OpenTiles:
         with self._changing:
             known = self._regions.get(numbers)
             if known is not None:
-                for number in numbers:
+                for number in (*_beside(known), *numbers):
                     self._opened.move_to_end(number)
                     self._source.used(self._manifest.tiles[number])
                 return known
@@ -338,12 +335,27 @@ class OpenTiles:
             each.cloud is not None and each.cloud.has_brightness for each in opened
         )
         drawn = range(len(numbers)) if opened is not None or isinstance(self._source, LocalTiles) else None
+        own = {} if opened is None else dict(zip(numbers, opened, strict=True))
+        kept: dict[tuple[int, ...], Surfels] = {}
+
+        def surfels_of(around: tuple[int, ...]) -> Surfels:
+            if (known := kept.get(around)) is not None:
+                return known
+            made = self._joined(around, own)
+            if opened is not None:  # the cloud of the whole map keeps no tile open
+                with self._changing:
+                    kept[around] = made
+                    if any(number not in self._opened for number in around):  # the region ends with its query
+                        self._regions.pop(tuple(sorted(numbers)), None)
+            return made
+
         return SurfelTiles(
             lambda xy_m: self.near(xy_m, among),
-            self.surfels_of,
+            surfels_of,
             middle_m,
             has_brightness,
             lambda: self.opened if drawn is None else [numbers[row] for row in drawn],
+            kept,
         )
 
     def near(
@@ -361,41 +373,20 @@ class OpenTiles:
         first = among[nearest_square(self.squares_m[among], xy_m)]
         return tiles_around(self._number, self._tile_m, xy_m, first)
 
-    def surfels_of(self, numbers: tuple[int, ...]) -> Surfels:
-        """Return the surfels of some tiles together. They are kept as long as all of these tiles are open.
-
-        Args:
-            numbers: numbers of the tiles, the one that gives the frame first.
-
-        Raises:
-            BundleError: as ``get``.
-        """
+    def _joined(self, numbers: tuple[int, ...], own: Mapping[int, MapBundle]) -> Surfels:
+        """Return the surfels of some tiles together. The first one gives the frame. ``own`` has tiles that need not be opened."""
+        closed = [number for number in numbers if number not in own]
+        opened = {**own, **dict(zip(closed, self.get_all(closed), strict=True))}
+        clouds = {number: opened[number].cloud for number in numbers}
+        if not isinstance(first := clouds[numbers[0]], SurfelMap):
+            raise damaged_file(self._path / self._manifest.tiles[numbers[0]].folder, "the tile has no cloud")
         if len(numbers) == 1:
-            return self._cloud_of(numbers[0], self.get(numbers[0]))
-        with self._changing:
-            if (known := self._joined.get(numbers)) is not None:
-                self._joined.move_to_end(numbers)
-                for number in numbers:
-                    self._opened.move_to_end(number)
-                    self._source.used(self._manifest.tiles[number])
-                return known
-        opened = dict(zip(numbers, self.get_all(numbers), strict=True))
-        self._cloud_of(numbers[0], opened[numbers[0]])
-        clouds = {number: bundle.cloud for number, bundle in opened.items() if isinstance(bundle.cloud, SurfelMap)}
+            return first
+        known = {number: cloud for number, cloud in clouds.items() if isinstance(cloud, SurfelMap)}
         tiles, edge_m = self._manifest.tiles, self._tile_m
-        ranks = [ranks_of_regions(cloud, tiles[number], edge_m) for number, cloud in clouds.items()]
-        made = JoinedSurfels.of(list(clouds.values()), ranks)
-        with self._changing:
-            if all(number in self._opened for number in numbers):
-                self._joined[numbers] = made
-                while len(self._joined) > MOST_JOINED:
-                    self._joined.popitem(last=False)
-        return made
-
-    def _cloud_of(self, number: int, bundle: MapBundle) -> SurfelMap:
-        if not isinstance(bundle.cloud, SurfelMap):
-            raise damaged_file(self._path / self._manifest.tiles[number].folder, "the tile has no cloud")
-        return bundle.cloud
+        return JoinedSurfels.of(
+            list(known.values()), [ranks_of_regions(cloud, tiles[number], edge_m) for number, cloud in known.items()]
+        )
 
     def _prepare(self, number: int) -> None:
         """Fetch and check a tile, and open it if there is room."""
@@ -442,9 +433,7 @@ class OpenTiles:
     def _close_some(self) -> None:
         while len(self._opened) > 1 and self._open_bytes() > self._limit:
             closed, _ = self._opened.popitem(last=False)
-            self._regions = {key: region for key, region in self._regions.items() if closed not in key}
-            for key in [key for key in self._joined if closed in key]:
-                del self._joined[key]
+            self._regions = {key: each for key, each in self._regions.items() if closed not in {*key, *_beside(each)}}
 
     def _open(self, tile: Tile, *, ahead: bool = False) -> MapBundle:
         """Open a tile. A request may do so, and its answer names no folder of the machine and no address."""
@@ -799,6 +788,15 @@ def expected_next(
     wanted = is_crossed | (away_m[rows] <= EXPECT_M)
     expected: NDArray[np.int64] = rows[order[wanted[order]]][:MOST_EXPECTED]
     return expected
+
+
+def _beside(region: Map) -> set[int]:
+    """Return the numbers of the tiles whose surfels a region has joined so far."""
+    return (
+        {number for around in region.cloud.kept for number in around}
+        if isinstance(region.cloud, SurfelTiles)
+        else set()
+    )
 
 
 def in_order(numbers: Int64[NDArray[np.int64], " n"]) -> Int64[NDArray[np.int64], " m"]:

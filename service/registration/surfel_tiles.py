@@ -1,8 +1,8 @@
 """The cloud of a tiled map: one surfel map for each tile. A pose is registered and rendered on those of the tiles around it, together."""
 
 import math
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -147,6 +147,7 @@ class SurfelTiles:
         origin_m: origin of the frame of the states that ``align`` registers, map frame, m.
         has_brightness: whether all tiles have intensities.
         drawn: returns the numbers of the tiles that may be drawn. A tile that is still in its store would have to be fetched first.
+        kept: surfels that ``surfels_of`` keeps, by the numbers of the tiles.
     """
 
     tiles_near: Callable[[Float64[NDArray[np.float64], "n 2"]], list[tuple[int, ...]]]
@@ -154,6 +155,7 @@ class SurfelTiles:
     origin_m: Float64[NDArray[np.float64], "3"]
     has_brightness: bool
     drawn: Callable[[], Sequence[int]]
+    kept: Mapping[tuple[int, ...], Surfels] = field(default_factory=dict)
 
     def at(self, position_m: Float64[NDArray[np.float64], "3"]) -> Surfels:
         """Return the surfels around a position.
