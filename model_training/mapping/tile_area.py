@@ -26,6 +26,8 @@ TILE_MARGIN_M = AROUND_M
 #: How far the cloud of a tile reaches beyond its own regions where another tile is, metres. It is more than the reach of a surfel in the
 #: lookup grid (``surfel_map.REACH_M``) plus the edge of a voxel.
 OVERLAP_M = 1.6
+#: How far the cloud of a tile reaches beyond its square at most, metres.
+CLOUD_MARGIN_M = TILE_MARGIN_M + REGION_M + OVERLAP_M
 #: A place is surrounded by the cloud of its tile if all surfaces up to this distance are in it, metres.
 SURROUNDING_M = 45.0
 

@@ -16,13 +16,12 @@ from numpy.typing import NDArray
 from model_training.mapping.between import PlannedPlaces
 from model_training.mapping.cloud import CLOUD_REACH_M
 from model_training.mapping.survey import travelled_m
-from model_training.mapping.tile_area import OVERLAP_M, TILE_MARGIN_M, Square, TileArea
+from model_training.mapping.tile_area import CLOUD_MARGIN_M, Square, TileArea
 from service.errors import DatasetError
 from service.maps.manifest import LARGEST_TILE_M, MOST_TILES, SMALLEST_TILE_M
-from service.registration.surfel_map import REGION_M
 
 #: How far the scans of a tile lie beyond its square at most, metres. Farther scans have no point in the cloud.
-SCANS_MARGIN_M = TILE_MARGIN_M + REGION_M + OVERLAP_M + CLOUD_REACH_M
+SCANS_MARGIN_M = CLOUD_MARGIN_M + CLOUD_REACH_M
 
 
 @dataclass(frozen=True, slots=True, eq=False)

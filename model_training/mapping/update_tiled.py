@@ -14,7 +14,7 @@ from model_training.mapping.settings import BuildSettings
 from model_training.mapping.stages import ResumedStages
 from model_training.mapping.stored_map import streets_of_bundle
 from model_training.mapping.survey import kept_scans
-from model_training.mapping.tile_area import TILE_MARGIN_M
+from model_training.mapping.tile_area import CLOUD_MARGIN_M
 from model_training.mapping.tile_tasks import finish_tiles, folder_of, is_of_tile
 from model_training.mapping.tiled_care import ColumnRow, tiles_of
 from model_training.mapping.tiles import TilePart, places_xy, tile_parts
@@ -158,7 +158,7 @@ def _require_common(whole: TiledMap) -> None:
 def _touch(square: ColumnRow, part: TilePart) -> bool:
     """Return whether the cloud of a square's tile reaches into that of another tile."""
     away = max(abs(square[0] - part.square.column), abs(square[1] - part.square.row)) - 1
-    return away * part.square.tile_m < 2 * TILE_MARGIN_M
+    return away * part.square.tile_m < 2 * CLOUD_MARGIN_M
 
 
 def _square(part: TilePart) -> ColumnRow:
