@@ -170,7 +170,7 @@ def tiles_of(content: BundleContent) -> dict[tuple[int, int], BundleContent]:
     squares = [(column, row) for column, row in np.unique(cells, axis=0).tolist()]
     tiles = {}
     for column, row in squares:
-        own = cloud_of_tile(cloud, TileArea(Square(column, row, TILE_M), set(squares)))
+        own = cloud_of_tile(cloud, TileArea(Square(column, row, TILE_M), set(squares), content.parameters["voxel_m"]))
         tiles[column, row] = replace(of_places(content, (cells == (column, row)).all(axis=1)), cloud=own)
     return tiles
 

@@ -22,7 +22,7 @@ from model_training.mapping.settings import BuildSettings
 from model_training.mapping.site_check import HeldScan, held_out, site_of
 from model_training.mapping.stages import ResumedStages
 from model_training.mapping.survey import kept_scans, levelled_scans, require_poses_within
-from model_training.mapping.tile_area import OVERLAP_M
+from model_training.mapping.tile_area import overlap_m
 from model_training.mapping.voxel_map import VoxelMap, lattice_origin
 from model_training.mapping.work import key_of, work_beside
 from service.errors import BundleError, DatasetError
@@ -194,7 +194,7 @@ def _content(drive: SurveyTraversal, places: Places, encoder_file: Path, lidar_h
             "survey_scans": float(len(drive.poses) if part is None else part.survey_scans),
             "between_m": settings.between_m,
             "places_between": float(places.between),
-            **({} if part is None else {"tile_overlap_m": OVERLAP_M}),
+            **({} if part is None else {"tile_overlap_m": overlap_m(settings.voxel_m)}),
             **settings.survey_accuracy(dataset.description.survey_accuracy),
             **done,
         },

@@ -96,7 +96,7 @@ def _tasks(
 ) -> list[TileTask]:
     """Plan the tiles: which scans and places each of them has, and what all have in common."""
     poses, kept = kept_scans(dataset, settings)
-    parts = list(tile_parts(poses, kept, tile_m=tile_m, between_m=settings.between_m))
+    parts = list(tile_parts(poses, kept, tile_m=tile_m, between_m=settings.between_m, voxel_m=settings.voxel_m))
     grid = ViewGrid(rows=encoder.rows, columns=encoder.columns)
 
     def sampled() -> dict[str, Any]:

@@ -1,13 +1,13 @@
 """``streetfix map merge``: merge two bundles of one frame and one encoder."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
 from model_training.mapping.build import tool_versions
 from model_training.mapping.cloud import with_cloud
 from model_training.mapping.join import joined, require_same
-from model_training.mapping.stored_map import content_of, empty_voxels_of, voxels_of
+from model_training.mapping.stored_map import content_of, empty_voxels_of, voxels_in, voxels_of
 from model_training.mapping.tile_area import TileArea
 from service.errors import BundleError
 from service.maps.manifest import Manifest
@@ -59,8 +59,36 @@ def merge_maps(
     report("merge", 2, 4)
     cloud = voxels_of(a)
     cloud.add_statistics(voxels_of(b).statistics())
+    if area is not None:
+        cloud.keep(area.is_in_cloud(cloud.means()))  # tiles beside it have the rest
     content = with_cloud(content, cloud, area)
     report("merge", 3, 4)
     made = write_bundle(out, content, overwrite=overwrite)
     report("merge", 4, 4)
     return made
+
+
+def with_ground_of(tile: Path, others: Sequence[Path], out: Path, area: TileArea) -> bool:
+    """Add to a tile what tiles of another map have on its ground. Write the new tile, or nothing if they have nothing there.
+
+    Args:
+        tile: folder of the tile.
+        others: folders of tiles of the other map, around its square.
+        out: folder of the new tile.
+        area: the ground that the new tile covers.
+
+    Returns:
+        Whether there is a new tile.
+
+    Raises:
+        BundleError: a tile is damaged, or the new one cannot be written.
+    """
+    bundle = MapBundle.open(tile)
+    added = voxels_in(others, area, empty_voxels_of(bundle))
+    if not len(added.sums()[0]):
+        return False
+    cloud = voxels_of(bundle)
+    cloud.add_statistics(added.statistics())
+    cloud.keep(area.is_in_cloud(cloud.means()))
+    write_bundle(out, with_cloud(replace(content_of(bundle), tool_versions=tool_versions()), cloud, area))
+    return True

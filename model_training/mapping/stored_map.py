@@ -1,12 +1,15 @@
 """Read a stored bundle back into the content that it was written from, to build another map from it."""
 
 import json
+from collections.abc import Iterable
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from model_training.mapping.voxel_map import VOXEL, VoxelMap, lattice_origin
+from model_training.mapping.tile_area import TileArea
+from model_training.mapping.voxel_map import MOMENTS, VOXEL, VoxelMap, lattice_origin
 from service.errors import BundleError
 from service.maps import content as parts
 from service.maps import streets
@@ -113,6 +116,33 @@ def voxels_of(bundle: MapBundle) -> VoxelMap:
             flat * (np.eye(3) - outer) + thick * outer,
         )
     return voxels
+
+
+def voxels_in(tiles: Iterable[Path], area: TileArea, empty: VoxelMap) -> VoxelMap:
+    """Return the voxels that some tiles have on the ground of another one.
+
+    Tiles store the points near their edges each on its own. So of a voxel that several have, the one with the most points is taken.
+
+    Args:
+        tiles: folders of the tiles.
+        area: the ground of the other tile.
+        empty: an empty voxel map, which gets the voxels.
+
+    Raises:
+        BundleError: as ``voxels_of``.
+    """
+    keys, moments = [np.zeros(0, np.int64)], [np.zeros((0, MOMENTS), np.float32)]
+    for path in tiles:
+        other = VoxelMap(empty.voxel_m, empty.origin)
+        other.add_statistics(voxels_of(MapBundle.open(path)).statistics())
+        inside = area.is_in_cloud(other.means())
+        keys.append(other.sums()[0][inside])
+        moments.append(other.sums()[1][inside])
+    of_all, sums = np.concatenate(keys), np.concatenate(moments)
+    order = np.lexsort((-sums[:, 0], of_all))
+    first = order[np.unique(of_all[order], return_index=True)[1]]
+    empty.add_sums(of_all[first], sums[first])
+    return empty
 
 
 def read_statistics(bundle: MapBundle) -> NDArray[Any]:

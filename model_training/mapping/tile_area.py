@@ -5,7 +5,7 @@ square. Its cloud has
 
 - the regions that it owns,
 - the regions of squares without a tile that begin within ``TILE_MARGIN_M`` of its square, because no tile owns them,
-- and ``OVERLAP_M`` more on all sides, because a cell at the edge of a region may be nearest to a surfel behind the edge.
+- and ``overlap_m`` more on all sides, because a cell at the edge of a region may be nearest to a surfel behind the edge.
 
 A query near an edge uses the clouds of all tiles around it (decision 0199).
 """
@@ -18,18 +18,33 @@ import numpy as np
 from numpy.typing import NDArray
 
 from model_training.mapping.cloud import CLOUD_REACH_M
-from service.registration.surfel_map import REGION_M, SurfelMap
+from service.registration.surfel_map import CELL_M, REACH_M, REGION_M, SurfelMap
 from service.registration.surfel_tiles import AROUND_M, columns_of_regions, first_region
 
 #: How far the cloud of a tile reaches beyond its square where no other tile is, metres: as far as a query is registered.
 TILE_MARGIN_M = AROUND_M
-#: How far the cloud of a tile reaches beyond its own regions where another tile is, metres. It is more than the reach of a surfel in the
-#: lookup grid (``surfel_map.REACH_M``) plus the edge of a voxel.
-OVERLAP_M = 1.6
-#: How far the cloud of a tile reaches beyond its square at most, metres.
-CLOUD_MARGIN_M = TILE_MARGIN_M + REGION_M + OVERLAP_M
 #: A place is surrounded by the cloud of its tile if all surfaces up to this distance are in it, metres.
 SURROUNDING_M = 45.0
+
+
+def overlap_m(voxel_m: float) -> float:
+    """Return how far the cloud of a tile reaches beyond its own regions where another tile is, metres.
+
+    The centre of a cell is at least half an edge inside its region. Its surfel needs its own voxel, and for the normal the voxels around.
+
+    Args:
+        voxel_m: edge of the cloud's voxels, metres.
+    """
+    return REACH_M - CELL_M / 2 + 2 * voxel_m
+
+
+def cloud_margin_m(voxel_m: float) -> float:
+    """Return how far the cloud of a tile reaches beyond its square at most, metres.
+
+    Args:
+        voxel_m: edge of the cloud's voxels, metres.
+    """
+    return TILE_MARGIN_M + REGION_M + overlap_m(voxel_m)
 
 
 @dataclass(frozen=True, slots=True, order=True)
@@ -109,14 +124,15 @@ class TileArea:
     Args:
         square: square of the tile.
         squares: columns and rows of all squares of the map that have a tile, this one included or not.
+        voxel_m: edge of the cloud's voxels, metres.
 
     Attributes:
         square: square of the tile.
         beside: columns and rows of the other squares with a tile around it, ascending.
     """
 
-    def __init__(self, square: Square, squares: Set[tuple[int, int]]) -> None:
-        self.square = square
+    def __init__(self, square: Square, squares: Set[tuple[int, int]], voxel_m: float) -> None:
+        self.square, self._overlap_m = square, overlap_m(voxel_m)
         reach = math.ceil((TILE_MARGIN_M + 2 * REGION_M) / square.tile_m)
         around = [
             Square(square.column + x, square.row + y, square.tile_m)
@@ -131,7 +147,7 @@ class TileArea:
         self._reached = square.ground.wider(TILE_MARGIN_M).in_whole_regions()
         free = (each.regions.within(self._reached) for each in around if each not in others)
         boxes = (square.regions, *(box for box in free if box.x0 < box.x1 and box.y0 < box.y1))
-        self._boxes = tuple(box.wider(OVERLAP_M) for box in boxes)
+        self._boxes = tuple(box.wider(self._overlap_m) for box in boxes)
 
     def is_in_cloud(self, positions: NDArray[np.float64]) -> NDArray[np.bool_]:
         """Return whether the cloud of the tile has each point (n,).
@@ -166,6 +182,15 @@ class TileArea:
         is_free = np.array([owner not in others for owner in map(tuple, owners.tolist())], np.bool_)
         return np.asarray(is_free & (self.square.regions.contains(centres) | self._reached.contains(centres)))
 
+    def may_share(self, square: tuple[int, int]) -> bool:
+        """Return whether the cloud of another tile may reach into this one.
+
+        Args:
+            square: column and row of the other tile.
+        """
+        away = max(abs(square[0] - self.square.column), abs(square[1] - self.square.row)) - 1
+        return away * self.square.tile_m < 2 * (TILE_MARGIN_M + REGION_M + self._overlap_m)
+
     def surrounds(self, positions: NDArray[np.float64]) -> NDArray[np.bool_]:
         """Return whether the cloud of the tile alone has all surfaces up to ``SURROUNDING_M`` around each position of its square (n,).
 
@@ -174,7 +199,7 @@ class TileArea:
         """
         found = np.ones(len(positions), np.bool_)
         for box in self._others:
-            found &= (box.away_m(positions) >= SURROUNDING_M - OVERLAP_M).any(axis=1)
+            found &= (box.away_m(positions) >= SURROUNDING_M - self._overlap_m).any(axis=1)
         return found
 
 

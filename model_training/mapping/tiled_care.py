@@ -1,12 +1,13 @@
 """``streetfix map diff`` and ``merge`` of tiled maps: operations on lists of tiles. A tile that is the same stays the same files."""
 
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
 from model_training.mapping.diff import diff_of
-from model_training.mapping.merge import merge_maps
+from model_training.mapping.merge import merge_maps, with_ground_of
+from model_training.mapping.stored_map import voxel_edge_m
 from model_training.mapping.tile_area import Square, TileArea
 from service.errors import BundleError
 from service.maps.calibration import Calibration, read_calibration
@@ -15,6 +16,7 @@ from service.maps.files import read_file
 from service.maps.manifest import Manifest, Tile, read_manifest
 from service.maps.reader import MapBundle
 from service.maps.tiled_writer import write_tiled
+from service.maps.tiles import require_shared_cloud
 
 #: Progress callback: stage, finished steps, all steps.
 Report = Callable[[str, int, int], None]
@@ -74,7 +76,8 @@ def merge_tiled(
 ) -> Manifest:
     """Merge two tiled maps into a new one; return its manifest.
 
-    A square that only one map has keeps its tile. Where both have a tile, ``merge_maps`` merges the two, unless they are the same. A
+    Where both have a tile, ``merge_maps`` merges the two, unless they are the same. A square that only one map has keeps its tile, unless
+    tiles of the other map have surfaces there. Then it gets these (``with_ground_of``). A
     correction for a rig stays if both maps have the same.
 
     Args:
@@ -98,22 +101,39 @@ def merge_tiled(
     with tempfile.TemporaryDirectory(prefix=f".{out.name}.", suffix=".merging", dir=out.parent) as merging:
         folders: dict[ColumnRow, Path] = {}
         for number, square in enumerate(squares, 1):
-            if square in one and square in two and one[square].version != two[square].version:
-                folders[square] = Path(merging) / f"{square[0]}_{square[1]}"
-                merge_maps(
-                    first / one[square].folder,
-                    second / two[square].folder,
-                    folders[square],
-                    name=name or read.name,
-                    area=TileArea(Square(*square, read.tile_m or 0.0), set(squares)),
-                )
+            of = [
+                path / tiles[square].folder if square in tiles else None
+                for path, tiles in ((first, one), (second, two))
+            ]
+            new = Path(merging) / f"{square[0]}_{square[1]}"
+            folders[square] = of[0] or of[1] or new
+            if of[0] is not None and of[1] is not None:
+                if one[square].version != two[square].version:
+                    area = _area(square, squares, read.tile_m or 0.0, of[0])
+                    merge_maps(of[0], of[1], new, name=name or read.name, area=area)
+                    folders[square] = new
             else:
-                folders[square] = first / one[square].folder if square in one else second / two[square].folder
+                # Tiles that only the other map has may have surfaces in this square.
+                path, tiles, known = (second, two, one) if of[1] is None else (first, one, two)
+                area = _area(square, squares, read.tile_m or 0.0, folders[square])
+                versions = {tile.version for tile in known.values()}
+                others = [
+                    path / tile.folder
+                    for each, tile in tiles.items()
+                    if tile.version not in versions and area.may_share(each)
+                ]
+                if others and with_ground_of(folders[square], others, new, area):
+                    folders[square] = new
             report("merge", number, len(squares))
         corrected = _with_common(_calibration_of(first), _calibration_of(second))
         return write_tiled(
             out, folders, read.tile_m or 0.0, name=name or read.name, overwrite=overwrite, corrected=corrected
         )
+
+
+def _area(square: ColumnRow, squares: Sequence[ColumnRow], tile_m: float, tile: Path) -> TileArea:
+    """Return the ground that a tile of the merged map covers. ``tile`` is a tile of its square."""
+    return TileArea(Square(*square, tile_m), set(squares), voxel_edge_m(MapBundle.open(tile, verify=False)))
 
 
 def _with_common(one: Calibration | None, other: Calibration | None) -> Calibration | None:
@@ -138,6 +158,7 @@ def _same_squares(first: Path, second: Path) -> tuple[Manifest, Manifest]:
                 f"{path}: a map of one bundle, but the other map is tiled; build it with --tile-m, or take two maps of one bundle",
                 field="tiles",
             )
+        require_shared_cloud(path, each)
     if read.tile_m != other.tile_m:
         raise BundleError(
             f"tile_m: {first} has {read.tile_m:g} m, {second} has {other.tile_m:g} m; build one of them again with the other's --tile-m",

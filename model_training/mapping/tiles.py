@@ -16,17 +16,14 @@ from numpy.typing import NDArray
 from model_training.mapping.between import PlannedPlaces
 from model_training.mapping.cloud import CLOUD_REACH_M
 from model_training.mapping.survey import travelled_m
-from model_training.mapping.tile_area import CLOUD_MARGIN_M, Square, TileArea
+from model_training.mapping.tile_area import Square, TileArea, cloud_margin_m
 from service.errors import DatasetError
 from service.maps.manifest import LARGEST_TILE_M, MOST_TILES, SMALLEST_TILE_M
-
-#: How far the scans of a tile lie beyond its square at most, metres. Farther scans have no point in the cloud.
-SCANS_MARGIN_M = CLOUD_MARGIN_M + CLOUD_REACH_M
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TilePart:
-    """The part of a survey that becomes a tile. Its K scans are all kept scans with points in the cloud.
+    """The part of a survey that becomes a tile. Its K scans are all kept scans with points in the cloud, and those of its places.
 
     Attributes:
         area: the ground that the tile covers.
@@ -94,6 +91,7 @@ def tile_parts(
     *,
     tile_m: float,
     between_m: float,
+    voxel_m: float,
     also: Iterable[tuple[int, int]] = (),
 ) -> Iterator[TilePart]:
     """Yield the tiles of a survey that have a place, by column and row.
@@ -103,6 +101,7 @@ def tile_parts(
         kept: indices of the kept scans, ascending (P,).
         tile_m: edge of the tiles, metres.
         between_m: largest distance between two places, metres; 0 puts none between scans.
+        voxel_m: edge of the cloud's voxels, metres.
         also: columns and rows of other squares that have a tile. They are yielded without a place too, and their parts may have no scan.
 
     Raises:
@@ -116,15 +115,17 @@ def tile_parts(
     of_way = columns_and_rows(places_xy(T, between_m)[len(T) :], tile_m)
     ways_in = _grouped(of_way)
     given_in = {square: len(found) for square, found in _grouped(columns_and_rows(poses[:, :3, 3], tile_m)).items()}
-    around = range(-math.ceil(SCANS_MARGIN_M / tile_m), math.ceil(SCANS_MARGIN_M / tile_m) + 1)
+    reach = math.ceil((cloud_margin_m(voxel_m) + CLOUD_REACH_M) / tile_m)  # farther scans have no point in the cloud
+    around = range(-reach, reach + 1)
     none = np.zeros(0, np.int64)
     squares = scans_in.keys() | ways_in.keys() | set(also)
     for column, row in sorted(squares):
-        area = TileArea(Square(column, row, tile_m), squares)
+        area, ways = TileArea(Square(column, row, tile_m), squares, voxel_m), ways_in.get((column, row), none)
         near = np.sort(np.concatenate([scans_in.get((column + x, row + y), none) for x in around for y in around]))
-        order = near[area.reads(xy[near])]
+        # A place on the way beyond the end of a traversal may have its two scans farther away than the cloud reaches.
+        order = np.unique(np.concatenate([near[area.reads(xy[near])], later[ways] - 1, later[ways]]))
         on_way: dict[int, tuple[float, ...]] = {}
-        for way in ways_in.get((column, row), none):
+        for way in ways:
             k = int(np.searchsorted(order, later[way]))
             on_way[k] = (*on_way.get(k, ()), float(share[way]))
         at_scan = (of_scan[order] == (column, row)).all(axis=1)

@@ -18,10 +18,10 @@ from model_training.mapping.join import of_places
 from model_training.mapping.places import SurveyTraversal, streets_of
 from model_training.mapping.settings import BuildSettings
 from model_training.mapping.stages import ResumedStages
-from model_training.mapping.stored_map import content_of, voxel_edge_m, voxels_of
+from model_training.mapping.stored_map import content_of, voxel_edge_m, voxels_in, voxels_of
 from model_training.mapping.tiles import TilePart
 from model_training.mapping.update import Replacement, updated, without
-from model_training.mapping.voxel_map import MOMENTS, VoxelMap, lattice_origin
+from model_training.mapping.voxel_map import VoxelMap, lattice_origin
 from model_training.mapping.work import BuildCache, key_of, work_beside
 from service.maps.content import BundleContent
 from service.maps.manifest import FILE, read_manifest
@@ -41,7 +41,7 @@ class TileUpdate:
 
     Attributes:
         old: folder of the tile. For a square without a tile, that of a tile to take the settings from.
-        beside: None for a tile of the map. For a new one, folders of the tiles whose clouds reach into its margin.
+        beside: None for a tile of the map. For a new one, folders of the tiles whose clouds reach into its own.
         source: the dataset with the survey, in the frame of the map.
         settings: settings of the tile.
         numbers: indices of the scans that the tile reads in the survey (K,).
@@ -203,7 +203,8 @@ def _before(update: TileUpdate, bundle: MapBundle) -> tuple[BundleContent, Voxel
     if update.beside is None:
         return content, voxels_of(bundle)
     origin = lattice_origin(voxel_edge_m(bundle), update.poses[:, :3, 3].mean(axis=0))
-    return _without_places(content), _in_margin(update.beside, update.part, VoxelMap(voxel_edge_m(bundle), origin))
+    empty = VoxelMap(voxel_edge_m(bundle), origin)
+    return _without_places(content), voxels_in(update.beside, update.part.area, empty)
 
 
 def _without_polygon(update: TileUpdate, content: BundleContent, cloud: VoxelMap) -> BundleContent:
@@ -222,22 +223,3 @@ def _without_places(content: BundleContent) -> BundleContent:
         parameters={**content.parameters, **dict.fromkeys(_COUNTED, 0.0)},
         calibration={**checked, "site": None} if checked["calibrated"] else checked,
     )
-
-
-def _in_margin(tiles: tuple[Path, ...], part: TilePart, empty: VoxelMap) -> VoxelMap:
-    """Return the voxels that some tiles have in the cloud of another one.
-
-    Tiles store the points near their edges each on its own. So of a voxel that several have, the one with the most points is taken.
-    """
-    keys, moments = [np.zeros(0, np.int64)], [np.zeros((0, MOMENTS), np.float32)]
-    for path in tiles:
-        other = VoxelMap(empty.voxel_m, empty.origin)
-        other.add_statistics(voxels_of(MapBundle.open(path)).statistics())
-        inside = part.area.is_in_cloud(other.means())
-        keys.append(other.sums()[0][inside])
-        moments.append(other.sums()[1][inside])
-    of_all, sums = np.concatenate(keys), np.concatenate(moments)
-    order = np.lexsort((-sums[:, 0], of_all))
-    first = order[np.unique(of_all[order], return_index=True)[1]]
-    empty.add_sums(of_all[first], sums[first])
-    return empty

@@ -1,6 +1,6 @@
 """``streetfix map update`` of a tiled map: a new survey changes only the tiles that it reaches. The other tiles stay the same files."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +14,6 @@ from model_training.mapping.settings import BuildSettings
 from model_training.mapping.stages import ResumedStages
 from model_training.mapping.stored_map import streets_of_bundle
 from model_training.mapping.survey import kept_scans
-from model_training.mapping.tile_area import CLOUD_MARGIN_M
 from model_training.mapping.tile_tasks import finish_tiles, folder_of, is_of_tile
 from model_training.mapping.tiled_care import ColumnRow, tiles_of
 from model_training.mapping.tiles import TilePart, places_xy, tile_parts
@@ -25,7 +24,7 @@ from model_training.tasks.engines import Engine, require_engine
 from service.errors import BundleError
 from service.maps.manifest import Manifest, read_manifest
 from service.maps.reader import MapBundle
-from service.maps.tiled_writer import write_tiled
+from service.maps.tiled_writer import require_lattice, write_tiled
 from service.maps.tiles import TiledMap
 from service.retrieval.encoder import Encoder
 
@@ -80,6 +79,9 @@ def update_tiled(
     whole = TiledMap.open(old)
     dataset = in_frame_of(dataset, whole)
     _require_common(whole)
+    require_lattice(
+        [old / tile.folder for tile in whole.manifest.tiles[:1]]
+    )  # the writer has checked those of several tiles
     replacement = Replacement.of(replace_covered, replace_area)
     # The streets of an updated tile must be those of the other tiles, so a survey cannot change a street here.
     streets = joined_streets(streets_of_bundle(whole), dataset.streets())
@@ -94,47 +96,66 @@ def update_tiled(
     with work_beside(out, key, also=is_of_tile) as work:
         seen = ResumedStages(work, dataset, kept, settings, report).rows_seen(whole.grid)
         require_rows(seen, whole, dataset)
-        changed = [
-            part
-            for part in tile_parts(poses, kept, tile_m=tile_m, between_m=settings.between_m, also=tiles)
-            if len(part.order) or _has_any(old / tiles[_square(part)].folder, replacement.inside)
-        ]
-        tasks = []
-        for done, part in enumerate(changed):
-            own, numbers = tiles.get(_square(part)), kept[part.order]
-            folder = path / (own or whole.manifest.tiles[0]).folder
-            update = TileUpdate(
-                old=folder,
-                beside=None if own else tuple(path / tiles[each].folder for each in tiles if _touch(each, part)),
-                source=FolderSource(dataset.folder.resolve(), dataset.frame),
-                settings=BuildSettings.of_map(read_manifest(folder), passes_vote=passes_vote),
-                numbers=numbers,
-                poses=poses[numbers],
-                part=part,
-                replace_covered=replace_covered,
-                replace_area=None if replace_area is None else replace_area.resolve(),
-                streets=streets,
+
+        def planned(present: Iterable[ColumnRow]) -> list[UpdateTask]:
+            """Plan the tiles that change, if these squares have a tile after the update."""
+            parts = tile_parts(
+                poses, kept, tile_m=tile_m, between_m=settings.between_m, voxel_m=settings.voxel_m, also=present
             )
-            tile_key = update.key()
-            tasks.append(UpdateTask(update, tile_key, folder_of(work, part.square, tile_key)))
-            report("planning tiles", done + 1, len(changed))
-        finish_tiles(
-            engine,
-            tasks,
-            update_tile,
-            work,
-            memory_of=memory_of,
-            remedy="give fewer --workers",
-            workers=workers,
-            report=report,
-            warn=warn,
-        )
-        folders = {square: old / tile.folder for square, tile in tiles.items()}
-        for task in tasks:
-            if task.no_place_left.is_file():
-                folders.pop(_square(task.update.part), None)
-            else:
-                folders[_square(task.update.part)] = task.folder
+            changed = [
+                part
+                for part in parts
+                if len(part.order)
+                or (_square(part) in tiles and _has_any(old / tiles[_square(part)].folder, replacement.inside))
+            ]
+            found = []
+            for done, part in enumerate(changed):
+                own, numbers = tiles.get(_square(part)), kept[part.order]
+                folder = path / (own or whole.manifest.tiles[0]).folder
+                update = TileUpdate(
+                    old=folder,
+                    beside=None
+                    if own
+                    else tuple(path / tiles[each].folder for each in tiles if part.area.may_share(each)),
+                    source=FolderSource(dataset.folder.resolve(), dataset.frame),
+                    settings=BuildSettings.of_map(read_manifest(folder), passes_vote=passes_vote),
+                    numbers=numbers,
+                    poses=poses[numbers],
+                    part=part,
+                    replace_covered=replace_covered,
+                    replace_area=None if replace_area is None else replace_area.resolve(),
+                    streets=streets,
+                )
+                tile_key = update.key()
+                found.append(UpdateTask(update, tile_key, folder_of(work, part.square, tile_key)))
+                report("planning tiles", done + 1, len(changed))
+            return found
+
+        def finish(tasks: list[UpdateTask]) -> None:
+            finish_tiles(
+                engine,
+                tasks,
+                update_tile,
+                work,
+                memory_of=memory_of,
+                remedy="give fewer --workers",
+                workers=workers,
+                report=report,
+                warn=warn,
+            )
+
+        tasks = planned(tiles)
+        finish(tasks)
+        if dropped := {_square(task.update.part) for task in tasks if task.no_place_left.is_file()}:
+            # The tiles around a dropped one were updated as if it had the surfaces of its square.
+            known = {task.key for task in tasks}
+            again = [task for task in planned(tiles.keys() - dropped) if task.key not in known]
+            replaced = dropped | {_square(task.update.part) for task in again}
+            if again:
+                finish([*tasks, *again])
+            tasks = [task for task in tasks if _square(task.update.part) not in replaced] + again
+        folders = {square: old / tile.folder for square, tile in tiles.items() if square not in dropped}
+        folders |= {_square(task.update.part): task.folder for task in tasks}
         report("joining tiles", 0, 1)
         manifest = write_tiled(
             out, folders, tile_m, name=whole.manifest.name, overwrite=overwrite, corrected=whole.calibration
@@ -153,12 +174,6 @@ def _require_common(whole: TiledMap) -> None:
                 f"{whole.path}: its tiles have different {name} ({found}), so no survey can be added; build the map again with one value",
                 field=name,
             )
-
-
-def _touch(square: ColumnRow, part: TilePart) -> bool:
-    """Return whether the cloud of a square's tile reaches into that of another tile."""
-    away = max(abs(square[0] - part.square.column), abs(square[1] - part.square.row)) - 1
-    return away * part.square.tile_m < 2 * CLOUD_MARGIN_M
 
 
 def _square(part: TilePart) -> ColumnRow:

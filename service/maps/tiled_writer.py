@@ -20,6 +20,8 @@ from service.maps.reader import NEEDED, MapBundle
 from service.maps.streets import Streets
 from service.maps.tiles import MOST_SEARCHED, differences, finds_tile, places_in_map, street_numbers
 from service.maps.writer import in_place, json_bytes, link_or_copy, sha256_of, sync
+from service.registration.surfel_map import SurfelMap
+from service.registration.surfel_tiles import lies_on_lattice
 
 #: Parameters of which the map states the largest of all tiles.
 LARGEST = ("survey_position_std_m", "survey_angle_std_deg", "surveyed_height_m")
@@ -61,6 +63,8 @@ def write_tiled(
     for folder, each in zip(folders[1:], manifests[1:], strict=True):
         if different := differences(each, manifests[0]):
             raise BundleError(f"{folder}: {different[0]} differs from {folders[0]}; {_REMEDY}", field="tiles")
+    if len(folders) > 1:
+        require_lattice(folders)
     remedy = "free disk space or choose another folder"
     with in_place(out, f"{out}: the map cannot be written", remedy) as partial:
         links = _Links()
@@ -79,6 +83,24 @@ def _opened(folder: Path) -> Manifest:
         raise BundleError(f"{folder}: a tiled map cannot be a tile; give its tiles", field="tiles")
     require_files(folder, read, NEEDED, verify=False)
     return read
+
+
+def require_lattice(folders: Sequence[Path]) -> None:
+    """Refuse tiles whose clouds do not fit to those of other tiles.
+
+    Args:
+        folders: folders of the tiles.
+
+    Raises:
+        BundleError: a tile is damaged, or its lookup grid does not lie on the common lattice.
+    """
+    for folder in folders:
+        cloud = MapBundle.open(folder, verify=False).cloud
+        if isinstance(cloud, SurfelMap) and not lies_on_lattice(cloud):
+            raise BundleError(
+                f"{folder}: its cloud does not fit to those of other tiles, as in a map of one bundle; build the map with --tile-m",
+                field="tiles",
+            )
 
 
 class _Links:

@@ -53,6 +53,8 @@ LEAST_STEP_M = 0.05
 PREPARE_EVERY_S = 10.0
 #: Largest number of regions that are kept, each put together from several tiles.
 MOST_REGIONS = 16
+#: Largest number of joined clouds that the cloud of the whole map keeps.
+MOST_KEPT = 16
 _NEEDED = (parts.ENCODER_FILE, parts.PLACES_FILE, parts.CALIBRATION_FILE)
 
 
@@ -199,6 +201,7 @@ class OpenTiles:
         self._prepared_s: dict[int, float] = {}
         self._opened: OrderedDict[int, MapBundle] = OrderedDict()
         self._regions: dict[tuple[int, ...], Map] = {}
+        self._kept_of_map: dict[tuple[int, ...], Surfels] = {}
         self._changing = threading.Lock()
         self._opening: defaultdict[int, threading.Lock] = defaultdict(threading.Lock)
         corners = np.array(
@@ -336,21 +339,33 @@ class OpenTiles:
         )
         drawn = range(len(numbers)) if opened is not None or isinstance(self._source, LocalTiles) else None
         own = {} if opened is None else dict(zip(numbers, opened, strict=True))
-        kept: dict[tuple[int, ...], Surfels] = {}
+        kept: dict[tuple[int, ...], Surfels] = {} if opened is not None else self._kept_of_map
+
+        def tiles_near(xy_m: Float64[NDArray[np.float64], "n 2"]) -> list[tuple[int, ...]]:
+            found = self.near(xy_m, among)
+            if opened is not None:  # a query opens all its tiles side by side
+                closed = sorted({number for around in found for number in around} - own.keys())
+                own.update(zip(closed, self.get_all(closed), strict=True))
+            return found
 
         def surfels_of(around: tuple[int, ...]) -> Surfels:
             if (known := kept.get(around)) is not None:
                 return known
             made = self._joined(around, own)
-            if opened is not None:  # the cloud of the whole map keeps no tile open
-                with self._changing:
+            with self._changing:
+                is_open = all(number in self._opened for number in around)
+                if opened is not None:
                     kept[around] = made
-                    if any(number not in self._opened for number in around):  # the region ends with its query
+                    if not is_open:  # the region ends with its query
                         self._regions.pop(tuple(sorted(numbers)), None)
+                elif is_open:
+                    kept[around] = made
+                    while len(kept) > MOST_KEPT:
+                        del kept[next(iter(kept))]
             return made
 
         return SurfelTiles(
-            lambda xy_m: self.near(xy_m, among),
+            tiles_near,
             surfels_of,
             middle_m,
             has_brightness,
@@ -378,11 +393,11 @@ class OpenTiles:
         closed = [number for number in numbers if number not in own]
         opened = {**own, **dict(zip(closed, self.get_all(closed), strict=True))}
         clouds = {number: opened[number].cloud for number in numbers}
-        if not isinstance(first := clouds[numbers[0]], SurfelMap):
-            raise damaged_file(self._path / self._manifest.tiles[numbers[0]].folder, "the tile has no cloud")
-        if len(numbers) == 1:
-            return first
         known = {number: cloud for number, cloud in clouds.items() if isinstance(cloud, SurfelMap)}
+        if not known:
+            raise damaged_file(self._path / self._manifest.tiles[numbers[0]].folder, "the tile has no cloud")
+        if len(known) == 1:
+            return next(iter(known.values()))
         tiles, edge_m = self._manifest.tiles, self._tile_m
         return JoinedSurfels.of(
             list(known.values()), [ranks_of_regions(cloud, tiles[number], edge_m) for number, cloud in known.items()]
@@ -433,6 +448,8 @@ class OpenTiles:
     def _close_some(self) -> None:
         while len(self._opened) > 1 and self._open_bytes() > self._limit:
             closed, _ = self._opened.popitem(last=False)
+            for around in [around for around in self._kept_of_map if closed in around]:
+                del self._kept_of_map[around]
             self._regions = {key: each for key, each in self._regions.items() if closed not in {*key, *_beside(each)}}
 
     def _open(self, tile: Tile, *, ahead: bool = False) -> MapBundle:
@@ -481,6 +498,21 @@ class OpenTiles:
         if self._verify:
             self._source.checked.add(tile.version, mark, Checked.ALL)
         return replace(bundle, places=places)
+
+
+def require_shared_cloud(path: Path, read: Manifest) -> None:
+    """Refuse a tiled map of an earlier release, whose tiles repeat the surfaces around them.
+
+    Args:
+        path: folder of the map.
+        read: its manifest.
+
+    Raises:
+        BundleError: the map is of an earlier release.
+    """
+    if "tile_margin_m" in read.parameters:
+        what = "its tiles overlap as in an earlier release; build the map again with this release"
+        raise BundleError(f"{path}: {what}", field=manifest.FILE)
 
 
 def differences(tile: Manifest, of_map: Manifest) -> list[str]:
@@ -603,9 +635,7 @@ class TiledMap(Map):
             raise BundleError(
                 f"{path}: a map of one bundle, not a tiled map; open it with open_map", field=manifest.FILE
             )
-        if "tile_margin_m" in read.parameters:
-            what = "its tiles overlap as in an earlier release; build the map again with this release"
-            raise BundleError(f"{path}: {what}", field=manifest.FILE)
+        require_shared_cloud(path, read)
         require_files(path, read, _NEEDED, verify=verify)
         named = read_streets(path, read)
         tiles = OpenTiles(path, read, named, source or LocalTiles(path), verify=verify, open_bytes=open_bytes)

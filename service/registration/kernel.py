@@ -338,9 +338,9 @@ class Piece:
     cubes: NDArray[Any] = field(init=False)
 
     def __post_init__(self) -> None:
-        cubes = self.grid.cubes
-        if self.served is not None:
-            cubes = cubes[self.served]
+        cubes = self.grid.cubes if self.served is None else self.grid.cubes[self.served]
+        if self.at_m.any():
+            cubes = cubes.copy()
             cubes["corner"] += self.at_m
         object.__setattr__(self, "cubes", cubes)
 

@@ -264,8 +264,8 @@ class SurfelMap:
             raise _defect("surfels", "there is none")
         _require_levels(self.grid)
         _require_surfels(self.grid, len(self.surfels))
-        if not np.isfinite(self.origin_m).all():
-            raise _defect("origin", "a coordinate is not finite")
+        if not (np.abs(self.origin_m) <= MOST_AWAY_M).all():
+            raise _defect("origin", f"a coordinate is not within {MOST_AWAY_M:g} m")
         if self.brightness is not None and (np.isinf(self.brightness).any() or (self.brightness < 0).any()):
             raise _defect(BRIGHTNESS, "a brightness is negative or infinite")
 

@@ -26,7 +26,7 @@ DRAWN_TILES = 64
 #: (``MAX_RANGE_M``), and the rendering of the map at a pose reads 45 m (``rendered_depth.REACH_M``).
 AROUND_M = 50.0
 #: Largest distance of a tile's grid from the lattice that all tiles share, as a part of a region.
-_OFF_LATTICE = 1e-3
+_OFF_LATTICE = 1e-5
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -60,7 +60,7 @@ def test_a_tile_has_the_cloud_of_its_area(made: Any) -> None:
     for number, tile in enumerate(opened.manifest.tiles):
         cloud = opened.tiles.get(number).cloud
         assert isinstance(cloud, SurfelMap)
-        inside = TileArea(Square(tile.column, tile.row, TILE_M), squares).is_in_cloud(
+        inside = TileArea(Square(tile.column, tile.row, TILE_M), squares, 0.3).is_in_cloud(
             cloud.unpacked(slice(None))["xyz"] + cloud.origin_m
         )
         assert inside.mean() > 0.999  # rounding moves surfels over the edge

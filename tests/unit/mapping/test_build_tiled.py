@@ -28,7 +28,7 @@ from model_training.mapping.build import build_map, describe
 from model_training.mapping.build_tile import build_tile, key_of_tile
 from model_training.mapping.build_tiled import build_tiled
 from model_training.mapping.settings import BuildSettings
-from model_training.mapping.tile_area import OVERLAP_M, Square, TileArea
+from model_training.mapping.tile_area import Square, TileArea
 from model_training.mapping.work import work_folder
 from model_training.tasks import local
 from service.errors import BundleError, DatasetError, ExtraMissingError
@@ -121,7 +121,7 @@ def test_a_tiled_map_has_every_place_of_an_untiled_one_in_its_square(small_datas
     rows = []
     for tile in made.tiles:
         bundle = MapBundle.open(tmp_path / "tiled" / tile.folder)
-        assert bundle.manifest.parameters["tile_overlap_m"] == OVERLAP_M
+        assert bundle.manifest.parameters["tile_overlap_m"] == pytest.approx(1.0 + 2 * 0.6)
         corner, xy = np.array([tile.column, tile.row]) * TILE_M, bundle.T_map_place[:, :2, 3]
         assert ((xy >= corner) & (xy < corner + TILE_M)).all()
         rows += places_of(bundle)
@@ -143,7 +143,7 @@ def test_the_cloud_of_a_tile_is_that_of_an_untiled_map_around_its_square(small_d
     whole = positions_of(MapBundle.open(tmp_path / "whole").cloud)
     squares = {(tile.column, tile.row) for tile in made.tiles}
     for tile in made.tiles:
-        area = TileArea(Square(tile.column, tile.row, TILE_M), squares)
+        area = TileArea(Square(tile.column, tile.row, TILE_M), squares, SETTINGS.voxel_m)
         found = positions_of(MapBundle.open(tmp_path / "tiled" / tile.folder).cloud)
         assert area.is_in_cloud(found).all()
         for some, every in ((found, whole), (whole, found)):
@@ -387,7 +387,7 @@ def test_tiles_check_the_confidence_with_scans_of_their_own(
         assert bundle.calibration.site is not None
         queries += bundle.calibration.site.queries
         at_scan = tile.counts.places - int(bundle.manifest.parameters["places_between"])
-        area = TileArea(Square(tile.column, tile.row, TILE_M), squares)
+        area = TileArea(Square(tile.column, tile.row, TILE_M), squares, SETTINGS.voxel_m)
         inner = area.surrounds(bundle.T_map_place[:at_scan, :2, 3])
         assert 2 <= inner.sum() < at_scan
         counted += int(inner.sum()) // 2

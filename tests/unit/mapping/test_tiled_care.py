@@ -39,9 +39,10 @@ def squares(small_map: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[t
     )
     third = np.arange(len(bundle.places)) * 3 // len(bundle.places)
     made = {}
-    for column in range(3):
-        made[column, 0] = folder / str(column)
-        write_bundle(made[column, 0], of_places(content, third == column))
+    for number in range(3):
+        square = (10 * number, 0)  # too far from each other to share surfaces
+        made[square] = folder / str(number)
+        write_bundle(made[square], of_places(content, third == number))
     return made
 
 

@@ -5,8 +5,8 @@ from hypothesis import strategies as st
 
 from model_training.mapping.between import PlannedPlaces
 from model_training.mapping.survey import travelled_m
-from model_training.mapping.tile_area import TILE_MARGIN_M, Square
-from model_training.mapping.tiles import SCANS_MARGIN_M, columns_and_rows, require_tile_edge, tile_parts
+from model_training.mapping.tile_area import TILE_MARGIN_M, Square, cloud_margin_m
+from model_training.mapping.tiles import columns_and_rows, require_tile_edge, tile_parts
 from service.errors import DatasetError
 from service.imaging.view_grid import MAX_RANGE_M
 from service.scoring.rendered_depth import REACH_M
@@ -23,7 +23,7 @@ def parts_of(xy, *, kept=None, tile_m=100.0, between_m=0.0):
     """Return the tiles of a traversal by column and row."""
     poses = track(xy)
     kept = np.arange(len(poses)) if kept is None else np.array(kept)
-    found = list(tile_parts(poses, kept, tile_m=tile_m, between_m=between_m))
+    found = list(tile_parts(poses, kept, tile_m=tile_m, between_m=between_m, voxel_m=0.3))
     squares = [(part.square.column, part.square.row) for part in found]
     assert squares == sorted(set(squares))
     return dict(zip(squares, found, strict=True))
@@ -75,7 +75,7 @@ def test_the_cloud_reaches_what_a_camera_at_the_edge_sees():
     area = parts_of([(50.0, 50.0)])[0, 0].area
     points = np.array([[155.1, 50.0, 3.0], [155.3, 50.0, 3.0], [-52.7, -52.7, 0.0], [50.0, -52.9, 0.0]])
     assert area.is_in_cloud(points).tolist() == [True, False, True, False]
-    assert max(MAX_RANGE_M, REACH_M) < TILE_MARGIN_M < SCANS_MARGIN_M
+    assert max(MAX_RANGE_M, REACH_M) < TILE_MARGIN_M
     centres = 25.6 * (np.array([[5, 1, 0], [6, 1, 0], [-2, -2, 0], [-3, 1, 0]]) + 0.5)
     assert area.has_cells(centres).tolist() == [True, False, True, False]
 
@@ -111,6 +111,18 @@ def test_a_place_between_scans_is_in_the_square_of_its_position():
     np.testing.assert_allclose(right.on_way[1], [1 / 3, 2 / 3, 4 / 3, 5 / 3, 2])
 
 
+def test_a_place_beyond_an_end_has_its_scans_however_far_they_are():
+    """The traversal begins in column 11. Its first place beyond the end is in column 10, whose regions end at 537.6 m. So the second scan
+    is farther from its cloud than 40 m, and another street drives around."""
+    way = [(564.85 + 14.9 * k, 25.0) for k in range(4)]
+    around = [(x, y) for y in (75.0, -25.0) for x in (525.0, 575.0)]
+    found = parts_of([*way, (2000.0, 0.0), *around], tile_m=50.0, between_m=14.0)
+    part = found[10, 0]
+    (k, shares), *others = part.plan.on_way.items()
+    assert (shares, others) == ((-1.0,), [])
+    assert part.order[[k - 1, k]].tolist() == [0, 1]
+
+
 def test_a_square_with_places_between_scans_alone_is_a_tile():
     """The way crosses the corner of a square in which no scan stands."""
     found = parts_of([(95, 103), (103, 95)], between_m=6.0)
@@ -138,8 +150,8 @@ def test_each_kept_scan_and_each_place_between_scans_is_in_exactly_one_tile(step
     found = parts_of(xy, tile_m=tile_m, between_m=between_m)
     at_scan, on_way = [], []
     for part in found.values():
-        assert part.order.tolist() == np.flatnonzero(part.area.reads(xy)).tolist()
-        assert part.square.within(SCANS_MARGIN_M, xy[part.order]).all()
+        assert set(np.flatnonzero(part.area.reads(xy)).tolist()) <= set(part.order.tolist())
+        assert part.square.within(cloud_margin_m(0.3) + 40.0, xy[part.order]).all()
         at_scan += part.order[part.plan.at_scan].tolist()
         for k, shares in part.plan.on_way.items():
             assert part.order[k - 1] == part.order[k] - 1  # both scans are at hand

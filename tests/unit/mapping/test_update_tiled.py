@@ -16,16 +16,19 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy.spatial import cKDTree
 from typer.testing import CliRunner
 
 from model_training.cli.map_care import app
 from model_training.datasets.dataset import Dataset, scan_path, write_tum
 from model_training.mapping import engines
+from model_training.mapping.build import build_map
 from model_training.mapping.build_tiled import build_tiled
 from model_training.mapping.join import of_places
 from model_training.mapping.settings import BuildSettings
 from model_training.mapping.stored_map import content_of, voxels_of
 from model_training.mapping.tile_area import Square, TileArea
+from model_training.mapping.tiled_care import merge_tiled
 from model_training.mapping.update_tile import SURFEL_BYTES, UpdateTask, _without_places, memory_of, update_tile
 from model_training.mapping.update_tiled import update_tiled
 from model_training.mapping.verify import damage_of
@@ -34,6 +37,7 @@ from service.errors import BundleError, DatasetError, ExtraMissingError
 from service.maps.manifest import read_manifest
 from service.maps.reader import MapBundle
 from service.maps.tiled_writer import write_tiled
+from service.maps.tiles import TiledMap
 from service.maps.writer import write_bundle
 
 SETTINGS = BuildSettings(
@@ -124,7 +128,10 @@ def tiles(path: Path) -> dict[tuple[int, int], Path]:
 
 def voxels(square: tuple[int, int], path: Path) -> dict[bytes, int]:
     """Return the number of points of each voxel of a tile, by its cell. The edge of the cloud cuts voxels, so they do not count."""
-    of_tile, area = voxels_of(MapBundle.open(path)), TileArea(Square(*square, TILE_M), set(tiles(path.parents[1])))
+    of_tile, area = (
+        voxels_of(MapBundle.open(path)),
+        TileArea(Square(*square, TILE_M), set(tiles(path.parents[1])), SETTINGS.voxel_m),
+    )
     found, means = of_tile.statistics(), of_tile.means()
     inside = np.all([area.is_in_cloud(means + (x, y, 0.0)) for x in (-0.6, 0.6) for y in (-0.6, 0.6)], axis=0)
     return {
@@ -181,6 +188,93 @@ def test_tiles_out_of_reach_stay_the_same_files(whole: Path, second: Dataset, tm
     assert [square for square in before if before[square].name == after[square].name] == [FAR]
     one, other = (path[FAR] / "places.npy" for path in (before, after))
     assert one.stat().st_ino == other.stat().st_ino
+
+
+@pytest.fixture(scope="module")
+def driven(small_dataset: Dataset, whole: Path, folder: Path) -> tuple[Dataset, Dataset]:
+    """The scans of one square of the street, and one scan of the other square, near the first."""
+    present, _ = sorted(tiles(whole).keys() - {FAR})
+    T = small_dataset.survey_poses()[:, :2, 3]
+    inside = (np.floor(T / TILE_M) == present).all(axis=1)
+    near = int(np.argmin(np.where(inside, np.inf, np.linalg.norm(T - T[inside].mean(axis=0), axis=1))))
+    first = written(small_dataset, folder / "in-square", np.flatnonzero(inside).tolist())
+    return first, written(small_dataset, folder / "beside", [near])
+
+
+def seen_from(path: Path, position_m: np.ndarray) -> np.ndarray:
+    """Return the surfels that a camera sees within 40 m, map frame, metres (n, 3)."""
+    cloud = TiledMap.open(path).cloud
+    assert cloud is not None
+    surfels = cloud.at(position_m)
+    rows = np.concatenate(
+        [
+            first + np.arange(cube["first"], cube["first"] + cube["count"])
+            for piece, first in zip(
+                surfels.pieces, np.cumsum([0, *(len(each.surfels) for each in surfels.pieces)]), strict=False
+            )
+            for cube in piece.cubes
+        ]
+    )
+    xyz = surfels.unpacked(rows)["xyz"] + surfels.origin_m
+    return xyz[np.linalg.norm(xyz[:, :2] - position_m[:2], axis=1) < 40.0]
+
+
+def lost(before: np.ndarray, after: np.ndarray) -> int:
+    """Return how many surfels have none within 1.2 m afterwards."""
+    tree: Any = cKDTree(after)
+    return int((tree.query(before)[0] > 1.2).sum())
+
+
+@pytest.mark.usefixtures("serial")
+def test_no_surface_is_lost_where_a_new_tile_appears(
+    driven: tuple[Dataset, Dataset], encoder_file: Path, tmp_path: Path
+) -> None:
+    """The first map alone has the surfaces of both squares. The second survey gives the other square its own tile."""
+    first, second = driven
+    one, other = (built(each, encoder_file, tmp_path / name) for each, name in ((first, "one"), (second, "other")))
+    T = first.survey_poses()[:, :3, 3]
+    at = T[np.argmin(np.linalg.norm(T - second.survey_poses()[0, :3, 3], axis=1))]
+    merge_tiled(one, other, tmp_path / "merged")
+    update_tiled(one, second, tmp_path / "updated")
+    before = seen_from(one, at)
+    assert len(before) > 1000
+    for name in ("merged", "updated"):
+        assert len(tiles(tmp_path / name)) == 2
+        assert damage_of(tmp_path / name) == []
+        assert lost(before, seen_from(tmp_path / name, at)) == 0
+        for square, tile in tiles(tmp_path / name).items():
+            area = TileArea(Square(*square, TILE_M), set(tiles(tmp_path / name)), SETTINGS.voxel_m)
+            assert area.is_in_cloud(voxels_of(MapBundle.open(tile)).means()).all()
+
+
+@pytest.mark.usefixtures("serial")
+def test_no_surface_of_the_survey_is_lost_where_a_tile_goes(
+    driven: tuple[Dataset, Dataset], whole: Path, encoder_file: Path, tmp_path: Path
+) -> None:
+    """The polygon empties the whole map, and the survey drives in one of the two squares. It sees the other one too."""
+    survey, _ = driven
+    area = polygon(tmp_path / "all.geojson", (-5000.0, -5000.0), (5000.0, 5000.0))
+    update_tiled(whole, survey, tmp_path / "m", replace_area=area)
+    built(survey, encoder_file, tmp_path / "alone")
+    assert tiles(tmp_path / "m").keys() == tiles(tmp_path / "alone").keys()
+    for at in survey.survey_poses()[:, :3, 3]:
+        assert lost(seen_from(tmp_path / "alone", at), seen_from(tmp_path / "m", at)) == 0
+
+
+@pytest.mark.usefixtures("serial")
+def test_a_plain_bundle_is_no_tile_among_others(
+    small_dataset: Dataset, whole: Path, encoder_file: Path, tmp_path: Path
+) -> None:
+    build_map(small_dataset, encoder_file, tmp_path / "plain", replace(SETTINGS, name="plain"), threads=1)
+    write_tiled(tmp_path / "one", {FAR: tmp_path / "plain"}, TILE_M, name="one")
+    TiledMap.open(tmp_path / "one").tiles.get(0)
+    refused = "its cloud does not fit to those of other tiles, as in a map of one bundle; build the map with --tile-m"
+    with pytest.raises(BundleError, match=refused):
+        update_tiled(tmp_path / "one", small_dataset, tmp_path / "m")
+    both = dict([next(iter(tiles(whole).items())), (FAR, tmp_path / "plain")])
+    with pytest.raises(BundleError, match=refused):
+        write_tiled(tmp_path / "m", both, TILE_M, name="m")
+    assert not (tmp_path / "m").exists()
 
 
 @pytest.fixture(scope="module")

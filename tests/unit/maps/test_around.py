@@ -71,7 +71,7 @@ def test_the_first_region_of_a_column_is_the_first_whose_centre_is_in_it(column:
 def test_tiles_together_are_the_whole_cloud() -> None:
     """Nine tiles of 60 m without one in the middle. Each surfel and each cell comes from one tile."""
     whole, squares = ground(0.0, 180.0), [square for square in NINE if square != (1, 1)]
-    clouds = [cloud_of_tile(whole, TileArea(Square(*square, 60.0), set(squares))) for square in squares]
+    clouds = [cloud_of_tile(whole, TileArea(Square(*square, 60.0), set(squares), 0.3)) for square in squares]
     assert all(lies_on_lattice(cloud) for cloud in clouds)
     assert sum(len(cloud.surfels) for cloud in clouds) > len(whole.surfels)
     ranks = [ranks_of_regions(cloud, tile_at(*square), 60.0) for cloud, square in zip(clouds, squares, strict=True)]
@@ -96,8 +96,8 @@ def assert_same_surfels(whole: SurfelMap, joined: JoinedSurfels, positions: np.n
 def test_a_tile_that_owns_a_region_goes_before_others_that_have_it() -> None:
     """The first tile was built when its neighbour had no tile, so it has a part of the neighbour's regions. Its surfels there are older."""
     old, new = ground(0.0, 120.0), ground(0.0, 120.0, step=0.25)
-    alone = cloud_of_tile(old, TileArea(Square(0, 0, 60.0), {(0, 0)}))
-    beside = cloud_of_tile(new, TileArea(Square(1, 0, 60.0), {(0, 0), (1, 0)}))
+    alone = cloud_of_tile(old, TileArea(Square(0, 0, 60.0), {(0, 0)}, 0.3))
+    beside = cloud_of_tile(new, TileArea(Square(1, 0, 60.0), {(0, 0), (1, 0)}, 0.3))
     ranks = [ranks_of_regions(alone, tile_at(0, 0), 60.0), ranks_of_regions(beside, tile_at(1, 0), 60.0)]
     first, second = JoinedSurfels.of([alone, beside], ranks).pieces
     border_m = first_region(1, 60.0) * REGION_M
@@ -121,7 +121,7 @@ def moved_origin(cloud: SurfelMap, area: TileArea, origin_m: np.ndarray) -> Surf
 
 def test_surfels_of_tiles_with_other_origins_lie_where_the_map_has_them() -> None:
     whole, squares = ground(0.0, 120.0), {(0, 0), (1, 0)}
-    areas = [TileArea(Square(column, 0, 60.0), squares) for column in range(2)]
+    areas = [TileArea(Square(column, 0, 60.0), squares, 0.3) for column in range(2)]
     origins = np.array([[10.0, 20.0, 3.0], [-5.0, 7.0, -40.0]])
     clouds = [moved_origin(cloud_of_tile(whole, area), area, at) for area, at in zip(areas, origins, strict=True)]
     ranks = [ranks_of_regions(cloud, tile_at(column, 0), 60.0) for column, cloud in enumerate(clouds)]

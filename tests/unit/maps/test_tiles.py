@@ -55,7 +55,7 @@ def split(whole: Path, folder: Path, tile_m: float = TILE_M) -> dict[tuple[int, 
     made = {}
     for column, row in squares:
         out = made[column, row] = folder / f"{column}_{row}"
-        own = cloud_of_tile(cloud, TileArea(Square(column, row, tile_m), set(squares)))
+        own = cloud_of_tile(cloud, TileArea(Square(column, row, tile_m), set(squares), 0.3))
         write_bundle(out, replace(of_places(content, (cells == (column, row)).all(axis=1)), cloud=own))
     return made
 
@@ -153,6 +153,47 @@ def test_a_prior_searches_only_its_own_tile(tiled: TiledMap, small_dataset: Any)
     assert len(searched.places) == again.manifest.tiles[0].counts.places
     around = again.tiles.near(searched.T_map_place[:, :2, 3], np.array([0]))  # their surfels are seen from its places
     assert {0} < set(again.tiles.opened) <= set().union(*around)
+
+
+def test_a_query_opens_each_tile_once_although_only_one_fits(tiled_path: Path) -> None:
+    """The tiles beside that of the camera stay with the query, and no later query finds them open."""
+    tight = TiledMap.open(tiled_path, open_bytes=1)
+    opened, open_tile = list[int](), tight.tiles._opened_from
+
+    def counted(folder: Path, tile: Any) -> MapBundle:
+        opened.append(tile.version)
+        return open_tile(folder, tile)
+
+    tight.tiles._opened_from = counted  # type: ignore[method-assign]
+    at = tight.T_map_place[:, :3, 3]
+    for _ in range(2):
+        opened.clear()
+        region = tight.around(lambda: at[:1])
+        assert region.cloud is not None
+        for position_m in at:
+            region.cloud.at(position_m)
+        assert len(opened) == len(set(opened)) > 1
+        assert len(tight.tiles.opened) == 1
+        assert not tight.tiles._regions
+
+
+def test_the_cloud_of_the_whole_map_keeps_what_it_joined_while_the_tiles_are_open(tiled: TiledMap) -> None:
+    assert tiled.cloud is not None
+    at = tiled.T_map_place[0, :3, 3]
+    first = tiled.cloud.at(at)
+    assert tiled.cloud.at(at) is first
+    assert len(first.pieces) > 1
+    tight = TiledMap.open(tiled.path, open_bytes=1)
+    assert tight.cloud is not None
+    assert tight.cloud.at(at) is not tight.cloud.at(at)
+
+
+def test_a_tiled_map_of_an_earlier_release_is_refused(tiled_copy: Path) -> None:
+    old = read_manifest(tiled_copy)
+    old = old.model_copy(update={"parameters": {**old.parameters, "tile_margin_m": 50.0}}).stamped()
+    (tiled_copy / "manifest.json").write_bytes(old.to_bytes())
+    with pytest.raises(BundleError, match="its tiles overlap as in an earlier release; build the map again"):
+        TiledMap.open(tiled_copy)
 
 
 #: Nine squares of 500 m: columns -1 to 1, each with rows -1 to 1. Number 4 is the middle, 7 lies east of it and 5 north of it.

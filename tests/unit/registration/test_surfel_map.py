@@ -189,7 +189,7 @@ def test_a_frame_that_is_none_is_refused(arrays, entry, value):
 
 def test_an_origin_that_is_none_is_refused(arrays):
     arrays["origin"][0] = np.nan
-    refused(arrays, "origin", "not finite")
+    refused(arrays, "origin", "not within")
 
 
 def test_the_check_of_every_index_can_be_skipped(arrays):

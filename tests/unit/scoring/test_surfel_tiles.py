@@ -35,7 +35,7 @@ def clouds(street_map):
     joined = np.concatenate(surfels)
     whole = on_lattice(SurfelMap.prepare(np.zeros(3), joined, np.linspace(1, 2, len(joined), dtype=np.float32)))
     squares = [(column, row) for column in range(3) for row in (-1, 0)]
-    tiles = [cloud_of_tile(whole, TileArea(Square(*square, TILE_M), set(squares))) for square in squares]
+    tiles = [cloud_of_tile(whole, TileArea(Square(*square, TILE_M), set(squares), 0.3)) for square in squares]
 
     def near(xy_m):
         own = [squares.index((int(x), int(y))) for x, y in np.floor(xy_m / TILE_M)]
