@@ -108,14 +108,14 @@ def make_pictures_through(camera: PinholeCamera, *, seed: int = 3) -> tuple[NDAr
 
 
 def make_cloud() -> SurfelMap:
-    """What ``make_pictures`` sees from the true view, as the survey would have mapped it. Its grid fits to those of other tiles."""
+    """What ``make_pictures`` sees from the true view, as the survey would have mapped it."""
     _, depth_m, camera = make_pictures()
     points_camera = (camera.rays_of_pixels() * depth_m[..., None]).reshape(-1, 3)
     T_map_camera = true_pose()
     voxels = VoxelMap(0.3, np.round(T_map_camera[:3, 3]))
     for _ in range(3):  # so that every voxel has points enough for a normal
         voxels.add(transform_points(T_map_camera, points_camera))
-    return SurfelMap.of_packed(voxels.origin, *SurfelMap.packed(*voxels.surfels(), -voxels.origin))
+    return SurfelMap.prepare(voxels.origin, *voxels.surfels())
 
 
 def true_pose() -> NDArray[np.float64]:

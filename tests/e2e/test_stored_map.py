@@ -20,6 +20,7 @@ from service.maps.content import BundleContent
 from service.maps.store.transfer import push
 from service.maps.tiled_writer import write_tiled
 from service.maps.writer import write_bundle
+from tests.unit.lattice import as_tile
 
 COMMAND = [sys.executable, "-c", "from service.cli.main import main; main()", "serve"]
 URL = f"s3://{BUCKET}/town"
@@ -37,7 +38,7 @@ def push_version(folder: Path, content_of: Callable[..., BundleContent], encoder
     squares = {}
     for number in range(2):
         squares[number, 0] = folder / f"tiles-{seed}" / str(number)
-        write_bundle(squares[number, 0], content_of(seed=seed + number, encoder=encoder))
+        write_bundle(squares[number, 0], as_tile(content_of(seed=seed + number, encoder=encoder)))
     made = write_tiled(folder / f"town-{seed}", squares, 100.0, name="town")
     push(folder / f"town-{seed}", URL)
     return made.version

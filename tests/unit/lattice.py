@@ -1,7 +1,10 @@
 """Lookup grids as those of tiles."""
 
+from dataclasses import replace
+
 import numpy as np
 
+from service.maps.content import BundleContent
 from service.registration.surfel_map import SurfelMap
 
 
@@ -11,3 +14,8 @@ def on_lattice(cloud: SurfelMap | None) -> SurfelMap:
     rows = np.arange(len(cloud.surfels))
     packed = SurfelMap.packed(cloud.unpacked(rows), cloud.brightness_of(rows), -cloud.origin_m)
     return SurfelMap.of_packed(cloud.origin_m, *packed)
+
+
+def as_tile(content: BundleContent) -> BundleContent:
+    """Return the content of a bundle. Its cloud, if it has one, fits to those of other tiles."""
+    return content if content.cloud is None else replace(content, cloud=on_lattice(content.cloud))

@@ -20,6 +20,7 @@ from service.maps.tiles import TiledMap
 from service.maps.writer import write_bundle
 from service.runtime.engine import Engine
 from service.runtime.settings import Settings
+from tests.unit.lattice import as_tile
 
 TILE_M = 50.0
 
@@ -53,7 +54,7 @@ def tiled_path(content: BundleContent, tmp_path_factory: pytest.TempPathFactory)
         if row == 2:
             higher = np.stack([transform_from(T[:3, :3], T[:3, 3] + 0.3 * T[:3, 2]) for T in part.T_map_place])
             part = replace(part, T_map_place=higher, parameters={**part.parameters, "lidar_height_m": 2.1})
-        write_bundle(tiles[column, row], part)
+        write_bundle(tiles[column, row], as_tile(part))
     write_tiled(folder / "maps" / "tiny", tiles, TILE_M, name="tiny")
     return folder / "maps" / "tiny"
 
@@ -70,11 +71,23 @@ def tiled(tiled_engine: Engine, client_of: Callable[[Engine], httpx.Client]) -> 
     return client_of(tiled_engine)
 
 
+@pytest.fixture(scope="module")
+def whole(
+    content: BundleContent, tmp_path_factory: pytest.TempPathFactory, client_of: Callable[[Engine], httpx.Client]
+) -> Iterator[httpx.Client]:
+    """The map in one bundle, whose surfels are rounded like those of tiles."""
+    maps = tmp_path_factory.mktemp("whole") / "maps"
+    write_bundle(maps / "tiny", as_tile(content))
+    engine = Engine.open(Settings(maps=(maps,), threads=1, queue=1))
+    yield client_of(engine)
+    engine.close()
+
+
 def test_the_answer_is_that_of_one_bundle(
-    client: httpx.Client, tiled: httpx.Client, parts_of: Callable[..., dict[str, bytes]]
+    whole: httpx.Client, tiled: httpx.Client, parts_of: Callable[..., dict[str, bytes]]
 ) -> None:
     answers = []
-    for each in (client, tiled):
+    for each in (whole, tiled):
         response = each.post("/v1/localize", files={name: (name, data) for name, data in parts_of().items()})
         assert response.status_code == 200, response.text
         answers.append(response.json())

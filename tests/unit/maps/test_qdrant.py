@@ -28,6 +28,7 @@ from service.maps.search_address import checked_name, checked_search_url
 from service.maps.tiled_writer import write_tiled
 from service.maps.tiles import MOST_SEARCHED, PlaceSearch, TiledMap
 from service.maps.writer import write_bundle
+from tests.unit.lattice import as_tile
 from tests.unit.maps.fake_qdrant import FakeQdrant
 
 pytest.importorskip("qdrant_client")
@@ -49,7 +50,7 @@ class Row:
             content.T_map_place[:, 1, 3] = 10.0
             random = np.random.default_rng((column, seed)).normal(size=content.descriptors.shape)
             content.descriptors[:] = random / np.linalg.norm(random, axis=1, keepdims=True)
-            write_bundle(path, content)
+            write_bundle(path, as_tile(content))
         return path
 
     def map(self, name: str, seeds: dict[int, int] | None = None, tiles: int = TILES) -> Path:

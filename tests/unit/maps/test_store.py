@@ -35,6 +35,7 @@ from service.maps.store.transfer import pull, push
 from service.maps.tiled_writer import write_tiled
 from service.maps.tiles import TiledMap, TileSource
 from service.maps.writer import write_bundle
+from tests.unit.lattice import as_tile
 
 Content = Callable[..., BundleContent]
 
@@ -44,7 +45,9 @@ def write_tiled_map(out: Path, content_of: Content, encoder: bytes, *, tiles: in
     squares = {}
     for number in range(tiles):
         squares[number, 0] = out.parent / f"{out.name}-tiles" / str(number)
-        write_bundle(squares[number, 0], content_of(seed=number + 1, encoder=encoder, preview_webp=b"a picture"))
+        write_bundle(
+            squares[number, 0], as_tile(content_of(seed=number + 1, encoder=encoder, preview_webp=b"a picture"))
+        )
     return write_tiled(out, squares, 100.0, name="town")
 
 

@@ -18,6 +18,7 @@ from service.runtime.engine import Engine, warm_up
 from service.runtime.map_registry import MapRegistry
 from service.runtime.map_watcher import MapWatcher
 from service.runtime.settings import MapUrl, Settings, load_settings
+from tests.unit.lattice import as_tile
 
 Content = Callable[..., BundleContent]
 
@@ -36,7 +37,9 @@ class Town:
         squares = {}
         for number in range(tiles):
             squares[number, 0] = self.folder / f"tiles-{self.versions}" / str(number)
-            write_bundle(squares[number, 0], self._content_of(seed=self.versions + number, encoder=self._encoder))
+            write_bundle(
+                squares[number, 0], as_tile(self._content_of(seed=self.versions + number, encoder=self._encoder))
+            )
         out = self.folder / f"town-{self.versions}"
         made = write_tiled(out, squares, 100.0, name="town")
         push(out, self.url)

@@ -20,6 +20,7 @@ from service.maps.writer import write_bundle
 from service.runtime.engine import warm_up
 from service.runtime.map_registry import MapRegistry
 from service.runtime.map_watcher import MapWatcher
+from tests.unit.lattice import as_tile
 
 Content = Callable[..., BundleContent]
 Write = Callable[[str, list[int]], Manifest]
@@ -35,7 +36,7 @@ def write(tmp_path: Path, content_of: Content, encoder_of: Callable[..., bytes])
         for column, seed in enumerate(seeds):
             squares[column, 0] = tmp_path / "made" / str(seed)
             if not squares[column, 0].exists():
-                write_bundle(squares[column, 0], content_of(seed=seed, encoder=encoder))
+                write_bundle(squares[column, 0], as_tile(content_of(seed=seed, encoder=encoder)))
         return write_tiled(tmp_path / "maps" / name, squares, 100.0, name="town")
 
     return version

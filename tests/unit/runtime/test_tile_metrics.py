@@ -17,6 +17,7 @@ from service.maps.tiles import TiledMap
 from service.maps.writer import write_bundle
 from service.runtime.engine import Engine
 from service.runtime.settings import MapUrl, Settings
+from tests.unit.lattice import as_tile
 
 REQUESTS = "streetfix_tile_requests_total"
 
@@ -36,7 +37,7 @@ def town(tmp_path: Path, content_of: Callable[..., BundleContent], encoder_of: C
     encoder, squares = encoder_of(), {}
     for number in range(3):
         squares[number, 0] = tmp_path / "made" / str(number)
-        write_bundle(squares[number, 0], content_of(seed=number, encoder=encoder))
+        write_bundle(squares[number, 0], as_tile(content_of(seed=number, encoder=encoder)))
     write_tiled(tmp_path / "town", squares, 100.0, name="town")
     push(tmp_path / "town", f"file://{tmp_path}/store/town")
     return f"file://{tmp_path}/store/town"
