@@ -40,7 +40,7 @@ from service.maps.tiles import (
 from service.maps.writer import replace_calibration, write_bundle
 from service.registration.surfel_map import SurfelMap
 from service.retrieval.prior import Prior
-from tests.unit.lattice import on_lattice
+from tests.unit.lattice import as_tile, on_lattice
 
 TILE_M = 50.0
 
@@ -322,7 +322,7 @@ def test_a_tile_that_was_opened_ahead_is_closed_first(
     encoder = encoder_of()
     made = {(column, 0): tmp_path / str(column) for column in range(3)}
     for (column, _), path in made.items():
-        write_bundle(path, content_of(seed=column, encoder=encoder))
+        write_bundle(path, as_tile(content_of(seed=column, encoder=encoder)))
     tiles = write_tiled(tmp_path / "three", made, TILE_M, name="three").tiles
     tiled = TiledMap.open(tmp_path / "three", open_bytes=sum(tile.size for tile in tiles) - 1)
     prepared = Prepared(tiled)
@@ -375,7 +375,7 @@ def with_unread_files(
     """Make a map of two tiles, each with 1,000 bytes that the service does not read; return it with the size of its other files."""
     made, encoder = {(column, 0): tmp_path / str(column) for column in range(2)}, encoder_of()
     for (column, _), path in made.items():
-        write_bundle(path, content_of(seed=column, encoder=encoder, preview_webp=bytes(1000)))
+        write_bundle(path, as_tile(content_of(seed=column, encoder=encoder, preview_webp=bytes(1000))))
     tiles = write_tiled(tmp_path / "two", made, TILE_M, name="two").tiles
     return tmp_path / "two", sum(tile.size for tile in tiles) - 2 * 1000
 
