@@ -126,10 +126,10 @@ def _remarks(row: dict[str, Any]) -> list[str]:
     reason = row.get("reason")
     if reason is not None and reason.get("outdated"):
         explained = "no value" if reason["explains"] is None else f"{reason['explains']:.5g}"
-        told.append(f"reason outdated, value changed (it explained {explained})")
+        told.append(f"Reason outdated, value changed (it explained {explained})")
     elif reason is not None:
         told.append(reason["text"])
-    return ["; ".join(told)] if told else []
+    return [". ".join(each.rstrip(".") for each in told)] if told else []
 
 
 def _conditions(values: dict[str, float | None]) -> list[str]:

@@ -100,26 +100,6 @@ class JoinedSurfels:
                 found[at] = values
         return found
 
-    def align(
-        self,
-        points: QueryPoints,
-        states: NDArray[Any],
-        options: SolverOptions,
-        *,
-        tolerance_m: float = TOLERANCE_M,
-        height_min_m: float = -1e9,
-    ) -> None:
-        """Register every start on these surfels, in place, then score it, as ``SurfelMap.align``.
-
-        Args:
-            points: of the query.
-            states: starts, (n,) of ``STATE``, relative to ``origin_m``; overwritten with the results.
-            options: of the solver.
-            tolerance_m: standard deviation of a point's distance to its surface in the score, m, apart from its noise.
-            height_min_m: points lower than this do not count in the score, m.
-        """
-        align(self.pieces, points, states, options, tolerance_m=tolerance_m, height_min_m=height_min_m)
-
     def _of_each(
         self, rows: NDArray[np.integer[Any]]
     ) -> list[tuple[SurfelMap, Bool[NDArray[np.bool_], " *n"], Int64[NDArray[np.int64], " m"]]]:
@@ -200,7 +180,7 @@ class SurfelTiles:
             some = states[rows]
             for name in ("t", "anchor"):
                 some[name] += moved_m
-            surfels.align(points, some, options, tolerance_m=tolerance_m, height_min_m=height_min_m)
+            align(surfels.pieces, points, some, options, tolerance_m=tolerance_m, height_min_m=height_min_m)
             for name in ("t", "anchor"):
                 some[name] -= moved_m
             states[rows] = some

@@ -91,8 +91,8 @@ def test_a_reason_for_another_value_is_not_shown():
         {"id": "a", **missed, "why": "of 3 minutes", "reason": {"explains": 1.0, "text": "a wall"}},
         {"id": "b", **missed, "reason": {"explains": 1.5, "outdated": True}},
     )
-    assert "- `a`: of 3 minutes; a wall" in lines
-    assert "- `b`: reason outdated, value changed (it explained 1.5)" in lines
+    assert "- `a`: of 3 minutes. a wall" in lines
+    assert "- `b`: Reason outdated, value changed (it explained 1.5)" in lines
 
 
 def test_published_figures_stand_beside_ours_and_missing_recordings_are_listed():
