@@ -213,7 +213,7 @@ def _align(rng: np.random.Generator, cloud: SurfelMap) -> list[NDArray[Any]]:
         found.append(gradients(cloud.pieces, points, states[:1], OPTIONS, patch))
         del state
     grid = cloud.grid
-    return [*found, cloud.surfels, grid.slots, grid.regions, grid.blocks, grid.nearest, grid.others]
+    return [*found, cloud.surfels, grid.slots, grid.regions, grid.blocks, grid.cells, grid.others]
 
 
 def _render(rng: np.random.Generator, cloud: SurfelMap, height: int, width: int) -> list[NDArray[Any]]:

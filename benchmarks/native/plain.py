@@ -8,7 +8,7 @@ from service.geometry.rigid import Rotation, Transform
 from service.imaging import level
 from service.imaging.resample import FEWEST_SAMPLES, _sub_rays
 from service.imaging.view_grid import ViewGrid
-from service.registration.kernel import BLOCK, KEY_BITS, REGION, NearestGrid, QueryPoints, SolverOptions
+from service.registration.kernel import BLOCK, KEY_BITS, NUMBER_BITS, REGION, NearestGrid, QueryPoints, SolverOptions
 from service.registration.points import LEAST_NOISE, NOISE_ROWS, NOISE_STEPS, PointSettings
 from service.registration.rays import RayPicture, RaySettings
 from service.registration.visibility import DiscSettings
@@ -152,19 +152,35 @@ def surfels_of_cells(grid: NearestGrid, cells: NDArray[np.int64]) -> NDArray[np.
     inside = ((region >= 0) & (region < 1 << KEY_BITS)).all(axis=-1)
     key = np.where(inside, region @ [1 << 2 * KEY_BITS, 1 << KEY_BITS, 1], 0)
     at = np.minimum(np.searchsorted(grid.regions["key"], key), len(grid.regions) - 1)
-    row = grid.regions["row"][at, block @ [REGION * REGION, REGION, 1]].astype(np.int64)
-    inside &= (grid.regions["key"][at] == key) & (row > 0)
-    found = grid.blocks[np.where(inside, grid.regions["block"][at] + row - 1, 0)]
+    number = np.where(inside, block @ [REGION * REGION, REGION, 1], 0)
+    word, bit = grid.regions["has"][at, number // 64], (number % 64).astype(np.uint64)
+    inside &= (grid.regions["key"][at] == key) & (word >> bit & np.uint64(1) > 0)
+    row = grid.regions["before"][at, number // 64] + np.bitwise_count(word & ((np.uint64(1) << bit) - np.uint64(1)))
+    found = grid.blocks[np.where(inside, grid.regions["block"][at] + row, 0)]
     part = np.asarray(cell // 4 @ [4, 2, 1], np.int64)[..., None]
     bit = (cell % 4 @ [16, 4, 1]).astype(np.uint64)
     filled = np.take_along_axis(found["filled"], part, axis=-1)[..., 0]
     inside &= (filled >> bit & np.uint64(1)) > 0
-    before = np.take_along_axis(found["before"], part, axis=-1)[..., 0]
-    entry = found["first"] + before + np.bitwise_count(filled & ((np.uint64(1) << bit) - np.uint64(1)))
-    number = grid.nearest[np.where(inside, entry, 0)].astype(np.int64)
-    own, other, owned = (grid.regions[name].astype(np.int64)[at] for name in ("surfel", "other", "surfels"))
+    shift = (NUMBER_BITS * np.maximum(part[..., 0] - 1, 0)).astype(np.uint64)
+    before = np.where(part[..., 0] > 0, found["before"] >> shift & np.uint64((1 << NUMBER_BITS) - 1), np.uint64(0))
+    entry = before.astype(np.int64) + np.bitwise_count(filled & ((np.uint64(1) << bit) - np.uint64(1)))
+    first = grid.regions["cells"][at] + found["first"]
+    own, start = found["own"] & 255, found["own"] >> 8
+    read = np.append(grid.cells, np.uint8(0)).astype(np.int64)
+
+    def byte(at_byte: NDArray[np.int64], where: NDArray[np.bool_]) -> NDArray[np.int64]:
+        return read[np.where(inside & where, at_byte, 0)]
+
+    wide = found["before"] >> np.uint64(63) > 0
+    narrow = byte(first + entry, ~wide)
+    is_own = ~wide & (narrow < own)
+    listed = first - 2 * (narrow - own + 1)
+    foreign = byte(listed, ~wide & ~is_own) + (byte(listed + 1, ~wide & ~is_own) << 8)
+    three = sum(byte(first + 3 * entry + k, wide) << 8 * k for k in range(3))
+    number = np.where(wide, three, np.where(is_own, start + narrow, foreign))
+    surfel, other, owned = (grid.regions[name].astype(np.int64)[at] for name in ("surfel", "other", "surfels"))
     others = np.append(grid.others, np.int32(0))[np.where(inside & (number >= owned), other + number - owned, 0)]
-    return np.asarray(np.where(inside, np.where(number < owned, own + number, others), -1))
+    return np.asarray(np.where(inside, np.where(number < owned, surfel + number, others), -1))
 
 
 def information(

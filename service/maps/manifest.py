@@ -13,7 +13,7 @@ from service.geometry.earth import Georeference
 from service.imaging.view_grid import ViewGrid
 
 #: Version of the bundle format that this program reads and writes.
-FORMAT = 5
+FORMAT = 6
 FILE = "manifest.json"
 #: File of a dataset folder. Users confuse the two kinds of folders.
 DATASET_FILE = "dataset.json"
@@ -134,7 +134,7 @@ class Manifest(_Frozen):
         tiles: tiles of a tiled map, by column and row. ``counts`` has their sums, and ``files`` what they share.
     """
 
-    format: Literal[5]
+    format: Literal[6]
     name: Name
     version: Version
     made_at: AwareDatetime

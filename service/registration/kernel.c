@@ -18,23 +18,35 @@
 #define PART_CELLS 64 /* one bit of a uint64_t for each */
 #define REGION 8      /* blocks along the edge of a region */
 #define REGION_BLOCKS (REGION * REGION * REGION)
+#define REGION_WORDS (REGION_BLOCKS / 64)
 #define REGION_EDGE (REGION * BLOCK) /* cells along the edge of a region */
 #define KEY_BITS 18   /* bits of a region's number along each axis */
+#define NUMBER_BITS 9 /* bits of a block's number in its region, and of the number of filled cells before a part */
+#define OWN_BITS 8    /* bits of the number of a block's own surfels */
+#define NARROW 256    /* most surfels that the cells of a block refer to with one byte */
+#define FOREIGN_BYTES 2 /* bytes of a foreign surfel's number in a narrow block */
+#define WIDE_BYTES 3  /* bytes of a cell in a wide block */
 
-/* A block with at least one filled cell. A filled cell has a surfel in reach of its centre. */
+/* A block with at least one filled cell. A filled cell has a surfel in reach of its centre.
+ *
+ * A cell of a narrow block has one byte. Smaller numbers than that of the block's own surfels are these surfels. The numbers after them are
+ * foreign surfels, which the bytes before ``first`` list backwards. A cell of a wide block has the number of its surfel in the region. */
 typedef struct {
     uint64_t filled[PARTS]; /* bit (x * 4 + y) * 4 + z of a part: the cell is filled */
-    int64_t first;          /* entry of the block's first filled cell in nearest */
-    uint16_t before[PARTS]; /* number of filled cells in the parts before each part */
+    uint64_t before;        /* number of filled cells before parts 1 to 7, NUMBER_BITS each; uppermost bit: the block is wide */
+    uint32_t first;         /* byte of its first filled cell in cells, counted from the first byte of the region */
+    uint32_t own;           /* lower OWN_BITS: number of its own surfels; others: the first one, counted from that of the region */
 } Block;
 
-/* A region with at least one block or surfel. Its cells refer to surfels by numbers of the region: first its own surfels, then those of
- * other regions that are in ``others``. */
+/* A region with at least one block or surfel. It numbers its surfels block by block, then those of other regions that are in
+ * ``others``. */
 typedef struct {
     int64_t key;                 /* numbers of the region along x, y, z: (x << 36) + (y << 18) + z */
     int64_t block, surfel, other; /* rows of the region's first block in blocks, surfel in surfels, and entry in others */
+    int64_t cells;               /* first byte of its blocks in cells */
     uint32_t surfels, others;    /* number of its surfels, and of its entries in others */
-    uint16_t row[REGION_BLOCKS]; /* row of each block, counted from ``block``, plus 1; 0 for none */
+    uint64_t has[REGION_WORDS];  /* bit of each block's number: it has filled cells. The rows of these blocks are ascending by number */
+    uint16_t before[REGION_WORDS]; /* number of such blocks before each word of has */
 } Region;
 
 /* Surfels with their regions: a map of one bundle, or what a tile has of a tiled map. */
@@ -43,8 +55,7 @@ typedef struct {
     const int32_t *slots; /* hash table with linear probing: row of a region in regions, -1 for none */
     const Region *regions;
     const Block *blocks;
-    const void *nearest;         /* of each filled cell: number of the surfel nearest to its centre (uint16_t or uint32_t) */
-    int64_t nearest_bytes;       /* size of such a number: 2 or 4 */
+    const uint8_t *cells;        /* of each filled cell: the surfel nearest to its centre; see Block */
     const int32_t *others;       /* rows in surfels */
     const PackedSurfel *surfels;
     const uint8_t *served;       /* 1 for a region that this piece gives to the grid; 0: it gives all */
@@ -210,11 +221,48 @@ static inline void find_region(const Grid *g, int64_t key, int32_t entry, Recent
     }
 }
 
-/* Row of the surfel that an entry of ``nearest`` refers to. */
-static inline int64_t row_of(const Piece *piece, const Region *region, int64_t entry)
+/* Row of a block of a region, counted from its first one; -1 if the block has no filled cell. */
+static inline int64_t row_of_block(const Region *region, int32_t number)
 {
-    const int64_t number =
-        piece->nearest_bytes == 2 ? ((const uint16_t *)piece->nearest)[entry] : ((const uint32_t *)piece->nearest)[entry];
+    const uint64_t word = region->has[number / 64], bit = (uint64_t)1 << number % 64;
+    return word & bit ? region->before[number / 64] + __builtin_popcountll(word & (bit - 1)) : -1;
+}
+
+static inline int is_wide(const Block *block)
+{
+    return (int)(block->before >> 63);
+}
+
+/* Number of filled cells before a part. */
+static inline int64_t cells_before(const Block *block, int part)
+{
+    return part ? (int64_t)(block->before >> NUMBER_BITS * (part - 1) & ((1 << NUMBER_BITS) - 1)) : 0;
+}
+
+/* Number of a foreign surfel of a narrow block in the region. ``cells``: its first cell; ``place``: in the list of the foreign surfels. */
+static inline int64_t foreign_number(const uint8_t *cells, int64_t place)
+{
+    const uint8_t *at = cells - FOREIGN_BYTES * (place + 1);
+    return at[0] | at[1] << 8;
+}
+
+static inline int64_t wide_number(const uint8_t *cell)
+{
+    return cell[0] | cell[1] << 8 | cell[2] << 16;
+}
+
+/* Row of the surfel that a filled cell of a block refers to. ``entry``: number of filled cells before it. */
+static inline int64_t row_of(const Piece *piece, const Region *region, const Block *block, int64_t entry)
+{
+    const uint8_t *cells = piece->cells + region->cells + block->first;
+    int64_t number;
+    if (is_wide(block))
+        number = wide_number(cells + WIDE_BYTES * entry);
+    else {
+        const int64_t own = block->own & ((1 << OWN_BITS) - 1);
+        if (cells[entry] < own) return region->surfel + (block->own >> OWN_BITS) + cells[entry];
+        number = foreign_number(cells, cells[entry] - own);
+    }
     return number < region->surfels ? region->surfel + number : piece->others[region->other + number - region->surfels];
 }
 
@@ -258,30 +306,32 @@ static inline void find_cells(const Grid *g, double at[3][BATCH_SIZE], int64_t c
         pieces[k] = recent->piece[entry];
     }
     for (int64_t k = 0; k < count; k++) {
-        const int64_t row = regions[k]->row[number[k]];
-        blocks[k] = row ? pieces[k]->blocks + regions[k]->block + row - 1 : &EMPTY_BLOCK;
+        const int64_t row = row_of_block(regions[k], number[k]);
+        blocks[k] = row < 0 ? &EMPTY_BLOCK : pieces[k]->blocks + regions[k]->block + row;
         __builtin_prefetch(blocks[k]->filled + part[k]);
-        __builtin_prefetch(&blocks[k]->first);
+        __builtin_prefetch(&blocks[k]->before);
     }
     for (int64_t k = 0; k < count; k++) {
         const uint64_t filled = blocks[k]->filled[part[k]], cell = (uint64_t)1 << bit[k];
-        const int64_t entry = blocks[k]->first + blocks[k]->before[part[k]] + __builtin_popcountll(filled & (cell - 1));
-        __builtin_prefetch((const char *)pieces[k]->nearest + entry * pieces[k]->nearest_bytes);
+        const int64_t entry = cells_before(blocks[k], part[k]) + __builtin_popcountll(filled & (cell - 1));
+        __builtin_prefetch(pieces[k]->cells + regions[k]->cells + blocks[k]->first + entry); /* nearly all blocks are narrow */
         cells[k] = filled & cell ? entry : -1;
     }
-    for (int64_t k = 0; k < count; k++) rows[k] = cells[k] < 0 ? -1 : row_of(pieces[k], regions[k], cells[k]);
+    for (int64_t k = 0; k < count; k++) rows[k] = cells[k] < 0 ? -1 : row_of(pieces[k], regions[k], blocks[k], cells[k]);
 }
 
 /* Unpacks the surfels of a batch. The steps give the position modulo one region. A surfel of another region is less than half a region
  * away, so the candidate nearest to this region is the right one. */
 static inline void unpack(Batch *b, double cell)
 {
-    static const PackedSurfel none = {{0, 0, 0}, {0, 0}, 0, 0}; /* faces up */
+    static const PackedSurfel none = {{0, 0, 0}, {0, 0, 0}, 0, 0}; /* faces up */
     float packed[5][BATCH_SIZE];
     for (int k = 0; k < BATCH_SIZE; k++) {
         const PackedSurfel *m = b->surfel[k] ? b->surfel[k] : &none;
         packed[0][k] = m->xyz[0], packed[1][k] = m->xyz[1], packed[2][k] = m->xyz[2];
-        packed[3][k] = m->normal[0], packed[4][k] = m->normal[1];
+        int32_t pair[2];
+        normal_pair(m->normal, pair);
+        packed[3][k] = (float)pair[0], packed[4][k] = (float)pair[1];
         b->thickness[k] = b->surfel[k] ? unpack_thickness(m->thickness) : 1; /* avoids a variance of 0 */
         b->matched[k] = b->surfel[k] != 0;
     }
@@ -562,9 +612,9 @@ static inline void enter(int32_t surfel, const int64_t *low, const int64_t *high
 
 /* Builds one region; its key is set. ``xyz`` (n, 3): positions of all surfels, surfels' frame, m. ``which`` (count): rows of the surfels
  * whose reach may touch the region, ascending. Work memory for
- * all cells of the region: ``surfel_of`` and ``distance2``. Writes the row of each block to the region, the filled blocks to ``blocks``, and
- * the surfels of their filled cells to ``nearest``. The field ``first`` of a block counts from the start of ``nearest``. Returns the number
- * of blocks. */
+ * all cells of the region: ``surfel_of`` and ``distance2``. Writes to the region which blocks have filled cells, these blocks to ``blocks``, and
+ * the surfels of their filled cells to ``nearest``. The field ``first`` of a block counts from the start of ``nearest``, until
+ * streetfix_pack_cells. Returns the number of blocks. */
 WIDE int64_t streetfix_build_region(const Grid *g, const float *xyz, const int32_t *which, int64_t count, double reach, int32_t *surfel_of,
                                     float *distance2, Region *region, Block *blocks, int32_t *nearest)
 {
@@ -595,9 +645,9 @@ WIDE int64_t streetfix_build_region(const Grid *g, const float *xyz, const int32
     int64_t found = 0, cells = 0;
     for (int64_t number = 0; number < REGION_BLOCKS; number++) {
         const int64_t i = number / (REGION * REGION), j = number / REGION % REGION, l = number % REGION;
-        Block block = {.first = cells};
+        Block block = {.first = (uint32_t)cells};
         for (int part = 0; part < PARTS; part++) {
-            block.before[part] = (uint16_t)(cells - block.first);
+            if (part) block.before |= (uint64_t)(cells - block.first) << NUMBER_BITS * (part - 1);
             for (int cell = 0; cell < PART_CELLS; cell++) {
                 const int64_t x = i * BLOCK + part / 4 * PART + cell / (PART * PART);
                 const int64_t y = j * BLOCK + part / 2 % 2 * PART + cell / PART % PART, z = l * BLOCK + part % 2 * PART + cell % PART;
@@ -607,10 +657,100 @@ WIDE int64_t streetfix_build_region(const Grid *g, const float *xyz, const int32
                 nearest[cells++] = surfel;
             }
         }
-        region->row[number] = cells > block.first ? (uint16_t)(found + 1) : 0;
-        if (cells > block.first) blocks[found++] = block;
+        if (number % 64 == 0) region->before[number / 64] = (uint16_t)found;
+        if (cells == block.first) continue;
+        region->has[number / 64] |= (uint64_t)1 << number % 64;
+        blocks[found++] = block;
     }
     return found;
+}
+
+/* Writes the cells of a region. ``numbers``: of the surfel of each filled cell, as the region numbers them, block by block. ``starts``
+ * (REGION_BLOCKS + 1): number of the first surfel of each block. ``place``: work memory for each number, -1 before and after. Needs up to
+ * WIDE_BYTES for each cell in ``cells``, and FOREIGN_BYTES * NARROW for each block. Returns the number of bytes. */
+int64_t streetfix_pack_cells(const Region *region, Block *blocks, const uint32_t *starts, const uint32_t *numbers, int32_t *place,
+                             uint8_t *cells)
+{
+    int64_t size = 0;
+    for (int32_t block_number = 0; block_number < REGION_BLOCKS; block_number++) {
+        const int64_t row = row_of_block(region, block_number);
+        if (row < 0) continue;
+        Block *block = blocks + row;
+        const uint32_t *of_cell = numbers + block->first, start = starts[block_number], own = starts[block_number + 1] - start;
+        const int64_t filled = cells_before(block, PARTS - 1) + __builtin_popcountll(block->filled[PARTS - 1]);
+        uint32_t foreign[PARTS * PART_CELLS];
+        int64_t count = 0;
+        int wide = own >> OWN_BITS != 0;
+        for (int64_t k = 0; k < filled; k++) {
+            if (of_cell[k] - start < own || place[of_cell[k]] >= 0) continue; /* unsigned: less than ``start`` is large */
+            wide |= of_cell[k] >> 8 * FOREIGN_BYTES != 0;
+            place[of_cell[k]] = (int32_t)count;
+            foreign[count++] = of_cell[k];
+        }
+        wide |= own + count > NARROW;
+        if (!wide) {
+            for (int64_t k = count - 1; k >= 0; k--, size += FOREIGN_BYTES)
+                cells[size] = (uint8_t)foreign[k], cells[size + 1] = (uint8_t)(foreign[k] >> 8);
+            block->own = own ? start << OWN_BITS | own : 0;
+        } else {
+            block->before |= (uint64_t)1 << 63;
+            block->own = 0;
+        }
+        block->first = (uint32_t)size;
+        for (int64_t k = 0; k < filled; k++) {
+            const uint32_t number = of_cell[k];
+            if (wide) {
+                for (int byte = 0; byte < WIDE_BYTES; byte++) cells[size++] = (uint8_t)(number >> 8 * byte);
+            } else
+                cells[size++] = (uint8_t)(number - start < own ? number - start : own + (uint32_t)place[number]);
+        }
+        for (int64_t k = 0; k < count; k++) place[foreign[k]] = -1;
+    }
+    return size;
+}
+
+/* What is wrong with the blocks of a grid (streetfix_check_cells); kernel.py has the texts. */
+enum { SOUND, FILLED_WRONG, CELLS_NOT_SHARED, SURFELS_OUTSIDE, CELL_OUTSIDE };
+
+/* Checks a block whose bytes begin at ``cells`` + ``at``, of ``size``. Writes where they end. */
+static inline int64_t check_block(const Region *region, const Block *block, const uint8_t *cells, int64_t at, int64_t size, int64_t *end)
+{
+    int64_t filled = 0;
+    for (int part = 0; part < PARTS; part++) {
+        if (cells_before(block, part) != filled) return FILLED_WRONG;
+        filled += __builtin_popcountll(block->filled[part]);
+    }
+    if (!filled) return FILLED_WRONG;
+    const int64_t first = region->cells + block->first, list = first - at, width = is_wide(block) ? WIDE_BYTES : 1;
+    if (list < 0 || list % FOREIGN_BYTES || (is_wide(block) && list) || first > size || size - first < filled * width)
+        return CELLS_NOT_SHARED;
+    const int64_t own = block->own & ((1 << OWN_BITS) - 1), foreign = list / FOREIGN_BYTES, start = block->own >> OWN_BITS;
+    if (start + own > region->surfels) return SURFELS_OUTSIDE;
+    const int64_t numbered = (int64_t)region->surfels + region->others;
+    for (int64_t k = 0; k < foreign; k++)
+        if (foreign_number(cells + first, k) >= numbered) return CELL_OUTSIDE;
+    for (int64_t k = 0; k < filled; k++)
+        if (is_wide(block) ? wide_number(cells + first + WIDE_BYTES * k) >= numbered : cells[first + k] >= own + foreign)
+            return CELL_OUTSIDE;
+    *end = first + filled * width;
+    return SOUND;
+}
+
+/* Checks that the blocks of all regions share out ``cells`` (size), and that all cells refer to surfels that their regions number. The
+ * caller has checked that the regions share out ``blocks``. */
+WIDE int64_t streetfix_check_cells(const Region *regions, int64_t count, const Block *blocks, const uint8_t *cells, int64_t size)
+{
+    int64_t at = 0;
+    for (const Region *region = regions; region < regions + count; region++) {
+        if (region->cells != at) return CELLS_NOT_SHARED;
+        int64_t rows = 0;
+        for (int word = 0; word < REGION_WORDS; word++) rows += __builtin_popcountll(region->has[word]);
+        for (int64_t row = 0; row < rows; row++) {
+            const int64_t found = check_block(region, blocks + region->block + row, cells, at, size, &at);
+            if (found != SOUND) return found;
+        }
+    }
+    return at == size ? SOUND : CELLS_NOT_SHARED;
 }
 
 /* Position of a surfel from the corner of the grid, in steps. */
@@ -620,12 +760,18 @@ static inline int64_t steps_of(const Grid *g, const Surfel *surfel, int axis)
     return llround((surfel->xyz[axis] - origin[axis]) / g->cell * STEPS);
 }
 
-/* Writes the key of the region that each surfel belongs to. */
+/* Writes the key of the region that each surfel belongs to, and the number of its block: NUMBER_BITS below the key. */
 void streetfix_keys(const Grid *g, const Surfel *surfels, int64_t count, int64_t *keys)
 {
-    for (int64_t i = 0; i < count; i++)
-        keys[i] = key_of(steps_of(g, surfels + i, 0) / CUBE_STEPS, steps_of(g, surfels + i, 1) / CUBE_STEPS,
-                         steps_of(g, surfels + i, 2) / CUBE_STEPS);
+    for (int64_t i = 0; i < count; i++) {
+        int64_t region[3], block = 0;
+        for (int a = 0; a < 3; a++) {
+            const int64_t steps = steps_of(g, surfels + i, a);
+            region[a] = steps / CUBE_STEPS;
+            block = block * REGION + steps / (BLOCK * STEPS) % REGION;
+        }
+        keys[i] = (key_of(region[0], region[1], region[2]) << NUMBER_BITS) + block;
+    }
 }
 
 static inline double clamped(double value, double most)
@@ -645,7 +791,9 @@ void streetfix_pack(const Grid *g, const Surfel *surfels, const int64_t *rows, i
             const double folded = (1 - fabs(y)) * (x < 0 ? -1 : 1);
             y = (1 - fabs(x)) * (y < 0 ? -1 : 1), x = folded;
         }
-        packed[i].normal[0] = (int16_t)lround(x * NORMAL_STEPS), packed[i].normal[1] = (int16_t)lround(y * NORMAL_STEPS);
+        const uint32_t low = (uint32_t)lround(x * NORMAL_STEPS) & ((1 << NORMAL_BITS) - 1);
+        const uint32_t bits = low | (uint32_t)lround(y * NORMAL_STEPS) << NORMAL_BITS;
+        for (int byte = 0; byte < 3; byte++) packed[i].normal[byte] = (uint8_t)(bits >> 8 * byte);
         packed[i].thickness = (uint8_t)clamped(round(sqrt(m->thickness_m > 0 ? (double)m->thickness_m / THICKNESS_M : 0)), UINT8_MAX);
         packed[i].points = m->points ? (uint8_t)clamped(1 + round(log((double)m->points) / POINTS_LOG), UINT8_MAX) : 0;
     }
@@ -786,12 +934,14 @@ void streetfix_consistency(const float *rendered, int64_t height, int64_t width,
 /* clang-format off */
 const LayoutEntry streetfix_layout[] = {
     SURFEL_LAYOUT,
-    LAYOUT_STRUCT(Block), LAYOUT_FIELD(Block, filled), LAYOUT_FIELD(Block, first), LAYOUT_FIELD(Block, before),
+    LAYOUT_STRUCT(Block), LAYOUT_FIELD(Block, filled), LAYOUT_FIELD(Block, before), LAYOUT_FIELD(Block, first),
+    LAYOUT_FIELD(Block, own),
     LAYOUT_STRUCT(Region), LAYOUT_FIELD(Region, key), LAYOUT_FIELD(Region, block), LAYOUT_FIELD(Region, surfel),
-    LAYOUT_FIELD(Region, other), LAYOUT_FIELD(Region, surfels), LAYOUT_FIELD(Region, others), LAYOUT_FIELD(Region, row),
+    LAYOUT_FIELD(Region, other), LAYOUT_FIELD(Region, cells), LAYOUT_FIELD(Region, surfels), LAYOUT_FIELD(Region, others), LAYOUT_FIELD(Region, has),
+    LAYOUT_FIELD(Region, before),
     LAYOUT_STRUCT(Piece), LAYOUT_FIELD(Piece, slot_bits), LAYOUT_FIELD(Piece, slots), LAYOUT_FIELD(Piece, regions),
-    LAYOUT_FIELD(Piece, blocks), LAYOUT_FIELD(Piece, nearest), LAYOUT_FIELD(Piece, nearest_bytes), LAYOUT_FIELD(Piece, others),
-    LAYOUT_FIELD(Piece, surfels), LAYOUT_FIELD(Piece, served), LAYOUT_FIELD(Piece, shift), LAYOUT_FIELD(Piece, first),
+    LAYOUT_FIELD(Piece, blocks), LAYOUT_FIELD(Piece, cells), LAYOUT_FIELD(Piece, others), LAYOUT_FIELD(Piece, surfels),
+    LAYOUT_FIELD(Piece, served), LAYOUT_FIELD(Piece, shift), LAYOUT_FIELD(Piece, first),
     LAYOUT_STRUCT(Grid), LAYOUT_FIELD(Grid, ox), LAYOUT_FIELD(Grid, oy), LAYOUT_FIELD(Grid, oz),
     LAYOUT_FIELD(Grid, cell), LAYOUT_FIELD(Grid, count), LAYOUT_FIELD(Grid, pieces),
     LAYOUT_STRUCT(Query), LAYOUT_FIELD(Query, count), LAYOUT_FIELD(Query, xyz), LAYOUT_FIELD(Query, ray),
@@ -808,7 +958,7 @@ const LayoutEntry streetfix_layout[] = {
     LAYOUT_STRUCT(Beam), LAYOUT_FIELD(Beam, hit), LAYOUT_FIELD(Beam, new), LAYOUT_FIELD(Beam, removed),
     LAYOUT_FIELD(Beam, outlier), LAYOUT_FIELD(Beam, roughness_m), LAYOUT_FIELD(Beam, span_m), LAYOUT_FIELD(Beam, threshold_sigmas),
     LAYOUT_FIELD(Beam, margin_m), LAYOUT_FIELD(Beam, unmapped_m), LAYOUT_FIELD(Beam, scale), LAYOUT_FIELD(Beam, offset),
-    LAYOUT_CONSTANT(UNKNOWNS), LAYOUT_CONSTANT(BLOCK), LAYOUT_CONSTANT(KEY_BITS), LAYOUT_CONSTANT(REGION), LAYOUT_CONSTANT(STEPS), LAYOUT_CONSTANT(BATCH_SIZE),
+    LAYOUT_CONSTANT(UNKNOWNS), LAYOUT_CONSTANT(BLOCK), LAYOUT_CONSTANT(KEY_BITS), LAYOUT_CONSTANT(NUMBER_BITS), LAYOUT_CONSTANT(REGION), LAYOUT_CONSTANT(STEPS), LAYOUT_CONSTANT(BATCH_SIZE),
     LAYOUT_END,
 };
 /* clang-format on */

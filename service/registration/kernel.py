@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float32, Float64, Int32
+from jaxtyping import Bool, Float32, Float64, Int32, UInt8, UInt32
 from numpy.typing import NDArray
 
 from service.compiled import load
@@ -30,6 +30,10 @@ BLOCK = 8
 REGION = 8
 #: Bits of a region's number along each axis, in its key.
 KEY_BITS = 18
+#: Bits of a block's number in its region, and of the number of filled cells before a part.
+NUMBER_BITS = 9
+#: Most surfels that a region numbers: the cells of a wide block have three bytes.
+_MOST_NUMBERED = 1 << 24
 #: Surfels that are assigned to regions at once. Each takes some hundred bytes meanwhile.
 _CHUNK = 1 << 16
 #: Points in a batch of the kernel. Arrays of points are padded to whole batches.
@@ -41,22 +45,25 @@ LIBRARY = Path(__file__).with_name("_kernel.so")
 #: A surfel: position (m, surfels' frame), unit normal, thickness across the surface (m), number of survey points.
 SURFEL = np.dtype([("xyz", "<f4", (3,)), ("normal", "<f4", (3,)), ("thickness_m", "<f4"), ("points", "<u4")])
 #: A surfel as a map holds it (``NearestGrid.unpacked``). xyz: position from the corner of its region, ``STEPS`` along the edge of a cell.
-#: normal: octahedral map of the unit vector (Meyer et al., Eurographics Symposium on Rendering 2010). thickness, points: codes.
-PACKED_SURFEL = np.dtype([("xyz", "<u2", (3,)), ("normal", "<i2", (2,)), ("thickness", "u1"), ("points", "u1")])
+#: normal: octahedral map of the unit vector (Meyer et al., Eurographics Symposium on Rendering 2010), two signed numbers of 12 bits.
+#: thickness, points: codes.
+PACKED_SURFEL = np.dtype([("xyz", "<u2", (3,)), ("normal", "u1", (3,)), ("thickness", "u1"), ("points", "u1")])
 #: Steps of a packed position along the edge of a cell.
 STEPS = 1024
 #: The surfels of a region: its corner (surfels' frame, m), row of the first, number.
 CUBE = np.dtype([("corner", "<f8", (3,)), ("first", "<i8"), ("count", "<i8")])
 #: A block of the lookup grid with at least one filled cell. A filled cell has a surfel in reach of its centre.
-#: filled: 64 bits for each part, bit (x * 4 + y) * 4 + z for a cell. first: entry of its first filled cell in ``NearestGrid.nearest``.
-#: before: number of filled cells in the parts before each part.
-GRID_BLOCK = np.dtype([("filled", "<u8", (8,)), ("first", "<i8"), ("before", "<u2", (8,))])
+#: filled: 64 bits for each part, bit (x * 4 + y) * 4 + z for a cell. before: number of filled cells before parts 1 to 7, 9 bits each; its
+#: uppermost bit is set for a wide block. first: byte of its first filled cell in ``NearestGrid.cells``, counted from ``cells`` of its
+#: region. own: number of its own surfels (lower 8 bits), and the first one, counted from ``surfel`` of its region (24 bits).
+GRID_BLOCK = np.dtype([("filled", "<u8", (8,)), ("before", "<u8"), ("first", "<u4"), ("own", "<u4")])
 #: A region with at least one block or surfel. key: its numbers along x, y and z, 18 bits each, x first. block, surfel, other: rows of its
-#: first block in ``NearestGrid.blocks``, of its first surfel, and of its first entry in ``NearestGrid.others``. surfels, others: numbers of
-#: its surfels and of its entries in ``others``. row: row of each block, counted from ``block``, plus 1; 0 for none.
+#: first block in ``NearestGrid.blocks``, of its first surfel, and of its first entry in ``NearestGrid.others``. cells: its first byte in
+#: ``NearestGrid.cells``. surfels, others: numbers of its surfels and of its entries in ``others``. has: a bit for the number
+#: (x * 8 + y) * 8 + z of each block that has filled cells. before: number of such blocks before each 64 bits.
 GRID_REGION = np.dtype(
-    [("key", "<i8"), ("block", "<i8"), ("surfel", "<i8"), ("other", "<i8"), ("surfels", "<u4"), ("others", "<u4"),
-     ("row", "<u2", (REGION**3,))]
+    [("key", "<i8"), ("block", "<i8"), ("surfel", "<i8"), ("other", "<i8"), ("cells", "<i8"), ("surfels", "<u4"), ("others", "<u4"),
+     ("has", "<u8", (REGION**3 // 64,)), ("before", "<u2", (REGION**3 // 64,))]
 )  # fmt: skip
 #: State of one start: pose of the level frame, scale, offset, centre and up axis of the priors, information, score, and how the
 #: solver ended.
@@ -71,9 +78,7 @@ STATE = np.dtype(
 class _Piece(Structure):
     _fields_ = [
         ("slot_bits", c_int64),
-        *((name, c_void_p) for name in ("slots", "regions", "blocks", "nearest")),
-        ("nearest_bytes", c_int64),
-        *((name, c_void_p) for name in ("others", "surfels", "served")),
+        *((name, c_void_p) for name in ("slots", "regions", "blocks", "cells", "others", "surfels", "served")),
         ("shift", c_int64 * 3),
         ("first", c_int64),
     ]
@@ -191,6 +196,7 @@ def _library() -> ctypes.CDLL:
             "UNKNOWNS": UNKNOWNS,
             "BLOCK": BLOCK,
             "KEY_BITS": KEY_BITS,
+            "NUMBER_BITS": NUMBER_BITS,
             "REGION": REGION,
             "STEPS": STEPS,
             "BATCH_SIZE": BATCH_SIZE,
@@ -221,6 +227,10 @@ def _library() -> ctypes.CDLL:
         POINTER(_Grid), c_void_p, c_void_p, c_int64, c_double, c_void_p, c_void_p, c_void_p, c_void_p, c_void_p,
     ]  # fmt: skip
     library.streetfix_build_region.restype = c_int64
+    library.streetfix_pack_cells.argtypes = [c_void_p, c_void_p, c_void_p, c_void_p, c_void_p, c_void_p]
+    library.streetfix_pack_cells.restype = c_int64
+    library.streetfix_check_cells.argtypes = [c_void_p, c_int64, c_void_p, c_void_p, c_int64]
+    library.streetfix_check_cells.restype = c_int64
     library.streetfix_fill_slots.argtypes = [c_void_p, c_int64, c_int64, c_void_p]
     library.streetfix_keys.argtypes = [POINTER(_Grid), c_void_p, c_int64, c_void_p]
     library.streetfix_pack.argtypes = [POINTER(_Grid), c_void_p, c_void_p, c_int64, c_void_p]
@@ -252,12 +262,22 @@ def numbers_of_regions(keys: NDArray[np.int64]) -> NDArray[np.int64]:
     return np.stack([keys >> 2 * KEY_BITS, keys >> KEY_BITS, keys], axis=1) & ((1 << KEY_BITS) - 1)
 
 
+#: What ``streetfix_check_cells`` finds: an array and what is wrong with it.
+_CELLS_DEFECTS = (
+    None,
+    ("blocks", "a number of filled cells is wrong"),
+    ("blocks", "the bytes of the cells are not shared out one after the other"),
+    ("blocks", "the surfels of a block are outside those of its region"),
+    ("cells", "a number is outside the surfels of its region"),
+)
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class NearestGrid:
     """Lookup grid of the surfel nearest to each cell's centre; may be memory-mapped.
 
     It has three levels: regions of 8 x 8 x 8 blocks of 8 x 8 x 8 cells. Regions, blocks and cells without a surfel in reach take no
-    memory. So the size follows the mapped surfaces, not the box around them. The surfels of a map are sorted by region.
+    memory. So the size follows the mapped surfaces, not the box around them. The surfels of a map are sorted by region and block.
 
     Attributes:
         origin_m: corner of the grid in the surfels' frame, m.
@@ -266,8 +286,10 @@ class NearestGrid:
             the number of regions.
         regions: (R,) of ``GRID_REGION``, ascending by key.
         blocks: (B,) of ``GRID_BLOCK``, region by region.
-        nearest: number of the surfel nearest to each filled cell, block by block, part by part, in the order of the bits (F,), uint16 or
-            uint32. A region numbers its own surfels first, then those of its entries in ``others``.
+        cells: the surfel nearest to each filled cell (F,). Of a narrow block: the numbers of its foreign surfels in the region, the last
+            first, two bytes each; then a byte for each filled cell, part by part, in the order of the bits. A byte below the number of the
+            block's own surfels is one of them, a larger one is a foreign surfel. Of a wide block: three bytes for each filled cell, the
+            number in the region. A region numbers its own surfels first, then those of its entries in ``others``.
         others: rows of surfels of other regions (E,), region by region.
         cubes: (R,) of ``CUBE``; computed.
     """
@@ -277,7 +299,7 @@ class NearestGrid:
     slots: Int32[NDArray[np.int32], " H"]
     regions: NDArray[Any]
     blocks: NDArray[Any]
-    nearest: NDArray[Any]
+    cells: UInt8[NDArray[np.uint8], " F"]
     others: Int32[NDArray[np.int32], " E"]
     cubes: NDArray[Any] = field(init=False)
 
@@ -291,6 +313,16 @@ class NearestGrid:
     def region_m(self) -> float:
         """Edge of a region, m."""
         return REGION * BLOCK * self.cell_m
+
+    def cells_defect(self) -> tuple[str, str] | None:
+        """Return the array whose content is wrong and what is wrong with it; None if all cells refer to surfels that their regions number.
+
+        The regions must share out the blocks. The library checks nothing when it looks a cell up.
+        """
+        found = _library().streetfix_check_cells(
+            self.regions.ctypes.data, len(self.regions), self.blocks.ctypes.data, self.cells.ctypes.data, len(self.cells)
+        )
+        return _CELLS_DEFECTS[found]
 
     def unpacked(self, surfels: NDArray[Any], rows: NDArray[np.integer[Any]]) -> NDArray[Any]:
         """Return surfels as numbers: (n,) of ``SURFEL``.
@@ -374,9 +406,9 @@ def _grid_of(pieces: tuple[Piece, ...]) -> _Grid:
     for one, piece, shift in zip(made, pieces, shifts, strict=True):
         grid = piece.grid
         one.slot_bits = len(grid.slots).bit_length() - 1
-        for name in ("slots", "regions", "blocks", "nearest", "others"):
+        for name in ("slots", "regions", "blocks", "cells", "others"):
             setattr(one, name, getattr(grid, name).ctypes.data)
-        one.nearest_bytes, one.surfels = grid.nearest.itemsize, piece.surfels.ctypes.data
+        one.surfels = piece.surfels.ctypes.data
         one.served = None if piece.served is None else piece.served.ctypes.data
         one.shift, one.first = (c_int64 * 3)(*shift), first
         first += len(piece.surfels)
@@ -515,7 +547,7 @@ class PackedSurfels:
     """The surfels of a map, and what their lookup grid is built from.
 
     Attributes:
-        surfels: (S,) of ``PACKED_SURFEL``, sorted by region.
+        surfels: (S,) of ``PACKED_SURFEL``, sorted by region and block.
         regions: (R,) of ``GRID_REGION``, ascending by key. Of the regions with surfels they have the key and the surfels.
         origin_m: corner of the grid in the surfels' frame, m.
         cell_m: edge of a cell, m.
@@ -543,7 +575,7 @@ def packed_map(
         reach_m: largest distance from a surfel to the centre of a cell that refers to it, m.
 
     Returns:
-        The grid, the surfels (S,) of ``PACKED_SURFEL`` sorted by region, and their rows in ``surfels`` (S,).
+        The grid, the surfels (S,) of ``PACKED_SURFEL`` sorted by region and block, and their rows in ``surfels`` (S,).
 
     Raises:
         StreetfixError: the surfels lie too far from each other for the numbers of the regions, or a number is not finite.
@@ -592,7 +624,7 @@ def packed_surfels(
     frame, keys = _Grid(*origin, cell_m), np.empty(len(surfels), np.int64)
     _library().streetfix_keys(byref(frame), surfels.ctypes.data, len(surfels), keys.ctypes.data)
     order = np.argsort(keys, kind="stable")
-    keys = keys[order]
+    keys = keys[order] >> NUMBER_BITS
     first = np.flatnonzero(np.r_[True, keys[1:] != keys[:-1]])
     own = np.zeros(len(first), GRID_REGION)
     own["key"], own["surfel"], own["surfels"] = keys[first], first, np.diff(np.r_[first, len(keys)])
@@ -618,43 +650,80 @@ def nearest_grid(packed: PackedSurfels, has_cells: ChooseRegions | None = None) 
     """
     origin, cell_m = packed.origin_m, packed.cell_m
     xyz = _positions(_without_cells(origin, cell_m, packed.regions), packed.surfels)
-    regions, blocks, nearest, others = [], [np.zeros(0, GRID_BLOCK)], [np.zeros(0, np.uint16)], [np.zeros(0, np.int32)]
-    first_block = first_cell = first_other = 0
-    for region, some, cells in _regions(xyz, packed.regions, origin, cell_m, packed.reach_m, has_cells):
-        numbers, foreign = _numbered(cells, region)
-        region["block"], region["other"], region["others"] = first_block, first_other, len(foreign)
-        some["first"] += first_cell
-        first_block, first_cell = first_block + len(some), first_cell + len(cells)
+    regions, blocks, cells, others = [], [np.zeros(0, GRID_BLOCK)], [np.zeros(0, np.uint8)], [np.zeros(0, np.int32)]
+    first_block = first_byte = first_other = 0
+    for region, some, rows in _regions(xyz, packed.regions, origin, cell_m, packed.reach_m, has_cells):
+        numbers, foreign = _numbered(rows, region)
+        region["block"], region["cells"], region["other"] = first_block, first_byte, first_other
+        region["others"] = len(foreign)
+        entries = _packed_cells(region, some, numbers, packed.surfels)
+        first_block, first_byte = first_block + len(some), first_byte + len(entries)
         first_other += len(foreign)
         regions.append(region)
         blocks.append(some)
-        nearest.append(numbers)
+        cells.append(entries)
         others.append(foreign)
     whole = np.concatenate(regions)
     slot_bits = max(1, (2 * len(whole) - 1).bit_length())
     slots = np.full(1 << slot_bits, -1, np.int32)
     _library().streetfix_fill_slots(whole.ctypes.data, len(whole), slot_bits, slots.ctypes.data)
-    # Two bytes are enough unless a region numbers more than 65,536 surfels. Then all numbers of the map take four.
-    entries = np.concatenate(nearest)
-    return NearestGrid(origin, cell_m, slots, whole, np.concatenate(blocks), entries, np.concatenate(others))
+    return NearestGrid(
+        origin, cell_m, slots, whole, np.concatenate(blocks), np.concatenate(cells), np.concatenate(others)
+    )
 
 
 def _numbered(
-    cells: Int32[NDArray[np.int32], " f"], region: NDArray[Any]
-) -> tuple[NDArray[Any], Int32[NDArray[np.int32], " e"]]:
-    """Return the rows of surfels as numbers of a region (f,), uint16 if they are small enough, and the rows of other regions (e,)."""
+    rows: Int32[NDArray[np.int32], " f"], region: NDArray[Any]
+) -> tuple[UInt32[NDArray[np.uint32], " f"], Int32[NDArray[np.int32], " e"]]:
+    """Return the rows of surfels as numbers of a region (f,), and the rows of other regions (e,).
+
+    Raises:
+        StreetfixError: the region numbers more surfels than a cell can refer to.
+    """
     own = int(region["surfels"][0])
-    numbers = cells.astype(np.int64) - region["surfel"]
+    numbers = rows.astype(np.int64) - region["surfel"]
     outside = (numbers < 0) | (numbers >= own)
-    foreign, place = np.unique(cells[outside], return_inverse=True)
+    foreign, place = np.unique(rows[outside], return_inverse=True)
+    if own + len(foreign) > _MOST_NUMBERED:
+        raise StreetfixError(
+            f"a cube of 64 cells of the lookup grid has {own + len(foreign):,} surfels instead of at most {_MOST_NUMBERED:,}; "
+            "build the map with larger voxels (--voxel-m)"
+        )
     numbers[outside] = own + place
-    return numbers.astype(np.uint16 if own + len(foreign) <= 1 << 16 else np.uint32), foreign
+    return numbers.astype(np.uint32), foreign
+
+
+def _packed_cells(
+    region: NDArray[Any], blocks: NDArray[Any], numbers: UInt32[NDArray[np.uint32], " f"], surfels: NDArray[Any]
+) -> UInt8[NDArray[np.uint8], " b"]:
+    """Return the bytes of the filled cells of a region, and complete its blocks in place.
+
+    Args:
+        region: the region (1,).
+        blocks: its blocks, whose ``first`` counts from the first filled cell of the region.
+        numbers: number of each filled cell's surfel in the region.
+        surfels: of the map, (S,) of ``PACKED_SURFEL``.
+    """
+    first, count = int(region["surfel"][0]), int(region["surfels"][0])
+    of_block = (surfels["xyz"][first : first + count] // (BLOCK * STEPS)) @ np.array([REGION * REGION, REGION, 1])
+    starts = np.searchsorted(of_block, np.arange(REGION**3 + 1)).astype(np.uint32)
+    place = np.full(count + int(region["others"][0]), -1, np.int32)
+    cells = np.empty(3 * len(numbers) + 512 * len(blocks), np.uint8)  # the most that the library may write
+    size = _library().streetfix_pack_cells(
+        region.ctypes.data,
+        blocks.ctypes.data,
+        starts.ctypes.data,
+        numbers.ctypes.data,
+        place.ctypes.data,
+        cells.ctypes.data,
+    )
+    return cells[:size].copy()
 
 
 def _without_cells(origin_m: Float64[NDArray[np.float64], "3"], cell_m: float, regions: NDArray[Any]) -> NearestGrid:
     """Return a grid that has only its regions. It can unpack surfels."""
     none = np.zeros(0, np.int32)
-    return NearestGrid(origin_m, cell_m, none, regions, np.zeros(0, GRID_BLOCK), np.zeros(0, np.uint16), none)
+    return NearestGrid(origin_m, cell_m, none, regions, np.zeros(0, GRID_BLOCK), np.zeros(0, np.uint8), none)
 
 
 def _positions(grid: NearestGrid, surfels: NDArray[Any]) -> Float32[NDArray[np.float32], "S 3"]:

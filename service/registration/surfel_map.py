@@ -48,11 +48,9 @@ _EXPECTED: dict[str, tuple[np.dtype[Any], tuple[int, ...]]] = {
     "grid_slots": (_NUMBERS, (-1,)),
     "grid_regions": (GRID_REGION, (-1,)),
     "grid_blocks": (GRID_BLOCK, (-1,)),
-    "grid_nearest": (np.dtype("<u2"), (-1,)),
+    "grid_cells": (np.dtype("u1"), (-1,)),
     "grid_others": (_NUMBERS, (-1,)),
 }
-#: ``grid_nearest`` of a map with more than 65,536 surfels in a region.
-_WIDE = np.dtype("<u4")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -63,7 +61,7 @@ class SurfelMap:
 
     Attributes:
         origin_m: origin of the surfels' frame, map frame, m.
-        surfels: (S,) of ``PACKED_SURFEL``, sorted by region of the grid.
+        surfels: (S,) of ``PACKED_SURFEL``, sorted by region and block of the grid.
         grid: lookup grid of the nearest surfel.
         brightness: mean intensity of each surfel's returns in the sensor's unit, NaN where unknown; None if the map has no intensities.
         pieces: surfels and grid as the kernel takes them; computed.
@@ -198,7 +196,7 @@ class SurfelMap:
         """Return the arrays to write, by name; ``from_arrays`` reads them again.
 
         Returns:
-            origin (3,), surfels (S,), grid_frame (4,), grid_slots (H,), grid_regions (R,), grid_blocks (B,), grid_nearest (F,),
+            origin (3,), surfels (S,), grid_frame (4,), grid_slots (H,), grid_regions (R,), grid_blocks (B,), grid_cells (F,),
             grid_others (E,). A map with intensities also has brightness (S,). ``grid_frame`` holds the grid's origin and the edge
             of its cells, m.
         """
@@ -209,7 +207,7 @@ class SurfelMap:
             "grid_slots": self.grid.slots,
             "grid_regions": self.grid.regions,
             "grid_blocks": self.grid.blocks,
-            "grid_nearest": self.grid.nearest,
+            "grid_cells": self.grid.cells,
             "grid_others": self.grid.others,
         }
         return arrays if self.brightness is None else arrays | {BRIGHTNESS: self.brightness}
@@ -220,7 +218,7 @@ class SurfelMap:
 
         Args:
             arrays: arrays by name, as ``arrays`` returns them: origin (3,), surfels (S,), grid_frame (4,), grid_slots (H,),
-                grid_regions (R,), grid_blocks (B,), grid_nearest (F,), grid_others (E,) and, if the map has intensities, brightness (S,).
+                grid_regions (R,), grid_blocks (B,), grid_cells (F,), grid_others (E,) and, if the map has intensities, brightness (S,).
             verify: check every index and number. The kernel itself does not check them.
 
         Raises:
@@ -231,8 +229,7 @@ class SurfelMap:
                 raise _defect(name, "missing")
             array = arrays[name]
             fits = len(shape) == array.ndim and all(w in (-1, has) for w, has in zip(shape, array.shape, strict=True))
-            wide = name == "grid_nearest" and array.dtype == _WIDE
-            if (array.dtype != dtype and not wide) or not fits or not array.flags["C_CONTIGUOUS"]:
+            if array.dtype != dtype or not fits or not array.flags["C_CONTIGUOUS"]:
                 raise _defect(
                     name, f"{array.dtype} of shape {array.shape} instead of {dtype} of shape {shape} (-1: any)"
                 )
@@ -247,7 +244,7 @@ class SurfelMap:
                 "grid_frame",
                 f"the corner is not within {MOST_AWAY_M:g} m, or the edge of a cell not between 0 and {LARGEST_CELL_M:g} m",
             )
-        parts = ("slots", "regions", "blocks", "nearest", "others")
+        parts = ("slots", "regions", "blocks", "cells", "others")
         grid = NearestGrid(frame[:3], float(frame[3]), *(arrays[f"grid_{name}"] for name in parts))
         found = cls(np.array(arrays["origin"]), arrays["surfels"], grid, brightness)
         if verify:
@@ -271,7 +268,7 @@ class SurfelMap:
 
 
 def _require_levels(grid: NearestGrid) -> None:
-    """Check that every region is in the hash table once, its blocks are in ``blocks``, and their filled cells in ``nearest``."""
+    """Check that every region is in the hash table once, and that its blocks are in ``blocks``."""
     slots, regions, blocks = grid.slots, grid.regions, grid.blocks
     if len(slots) < 2 or len(slots) & (len(slots) - 1) or len(slots) <= len(regions):
         raise _defect(
@@ -280,16 +277,10 @@ def _require_levels(grid: NearestGrid) -> None:
     _require_indices("grid_slots", slots, len(regions), least=-1)
     if not np.array_equal(np.sort(slots[slots >= 0]), np.arange(len(regions))):
         raise _defect("grid_slots", "a region is missing or occurs twice")
-    most = regions["row"].max(axis=1, initial=0).astype(np.int64)
-    _require_shares("grid_regions", "blocks", regions["block"], most, len(blocks))
-    cells = np.cumsum(np.bitwise_count(blocks["filled"]), axis=1, dtype=np.int64)
-    if (
-        (blocks["before"][:, 0] != 0).any()
-        or (blocks["before"][:, 1:] != cells[:, :-1]).any()
-        or (cells[:, -1] == 0).any()
-    ):
-        raise _defect("grid_blocks", "a number of filled cells is wrong")
-    _require_shares("grid_blocks", "cells", blocks["first"], cells[:, -1], len(grid.nearest))
+    found = np.cumsum(np.bitwise_count(regions["has"]), axis=1, dtype=np.int64)
+    if (regions["before"][:, 0] != 0).any() or (regions["before"][:, 1:] != found[:, :-1]).any():
+        raise _defect("grid_regions", "a number of blocks is wrong")
+    _require_shares("grid_regions", "blocks", regions["block"], found[:, -1], len(blocks))
 
 
 def _require_surfels(grid: NearestGrid, count: int) -> None:
@@ -298,12 +289,9 @@ def _require_surfels(grid: NearestGrid, count: int) -> None:
     _require_shares("grid_regions", "surfels", regions["surfel"], regions["surfels"], count)
     _require_shares("grid_regions", "entries of grid_others", regions["other"], regions["others"], len(grid.others))
     _require_indices("grid_others", grid.others, count, least=0)
-    if not len(grid.blocks):
-        return
-    numbered = regions["surfels"].astype(np.int64) + regions["others"]
-    largest = np.maximum.reduceat(grid.nearest, grid.blocks["first"])
-    if (largest >= np.repeat(numbered, regions["row"].max(axis=1))).any():
-        raise _defect("grid_nearest", "a number is outside the surfels of its region")
+    if (defect := grid.cells_defect()) is not None:
+        array, what = defect
+        raise _defect(f"grid_{array}", what)
 
 
 def _require_shares(name: str, what: str, first: NDArray[Any], count: NDArray[Any], whole: int) -> None:

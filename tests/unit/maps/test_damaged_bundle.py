@@ -112,8 +112,8 @@ def test_a_manifest_that_is_none_is_refused(bundle_copy: Path, text: str) -> Non
 
 
 def test_another_format_version_is_refused_with_both_versions(bundle_copy: Path) -> None:
-    edit_manifest(bundle_copy, lambda document: document.update(format=4), stamp=False)
-    with pytest.raises(BundleError, match="format 4, but this release reads format 5; build the map with this release"):
+    edit_manifest(bundle_copy, lambda document: document.update(format=5), stamp=False)
+    with pytest.raises(BundleError, match="format 5, but this release reads format 6; build the map with this release"):
         MapBundle.open(bundle_copy)
 
 
@@ -191,10 +191,10 @@ def test_a_pickled_array_is_never_loaded(bundle_copy: Path, tmp_path: Path) -> N
 
 
 def test_a_grid_that_points_outside_the_surfels_is_refused(bundle_copy: Path, tmp_path: Path) -> None:
-    nearest = np.load(bundle_copy / "cloud" / "grid_nearest.npy")
-    nearest[0] = 60_000
-    replace_file(bundle_copy, "cloud/grid_nearest.npy", npy_bytes(tmp_path / "a.npy", nearest))
-    with pytest.raises(BundleError, match=r"cloud/grid_nearest\.npy: a number is outside the surfels of its region"):
+    cells = np.load(bundle_copy / "cloud" / "grid_cells.npy")
+    cells[:] = 255
+    replace_file(bundle_copy, "cloud/grid_cells.npy", npy_bytes(tmp_path / "a.npy", cells))
+    with pytest.raises(BundleError, match=r"cloud/grid_cells\.npy: a number is outside the surfels of its region"):
         MapBundle.open(bundle_copy)
 
 

@@ -161,3 +161,10 @@ def test_a_coarse_copy_that_was_cut_off_is_refused(coarse: Path, kept: int) -> N
     coarse.write_bytes(coarse.read_bytes()[:kept])
     with pytest.raises(BundleError, match=r"coarse.faiss: .*copy or build the bundle again"):
         ScannedCopy.open(coarse, views=1500, dimension=32)
+
+
+def test_a_coarse_copy_takes_little_more_than_its_codes(tmp_path: Path) -> None:
+    """64 bytes for each view, and 64 axes of 256 numbers. FAISS would also write all 256 axes, with 256 kB."""
+    write_descriptors(tmp_path / "i.npy", unit_vectors(1500, 256))
+    write_coarse_copy(tmp_path / "coarse.faiss", read_descriptors(tmp_path / "i.npy"))
+    assert (tmp_path / "coarse.faiss").stat().st_size < 1500 * 64 + 4 * 64 * 256 + 4000

@@ -23,8 +23,8 @@ class Problem:
         normals = rng.normal(size=cells.shape)
         surfels["normal"] = normals / np.linalg.norm(normals, axis=1, keepdims=True)
         surfels["thickness_m"] = rng.uniform(0, 0.05, len(cells))
-        self.grid, self.packed, _ = packed_map(surfels, cell_m=0.3, reach_m=1.2)
-        self.surfels = self.grid.unpacked(self.packed, np.arange(len(surfels)))
+        self.grid, self.packed, order = packed_map(surfels, cell_m=0.3, reach_m=1.2)
+        self.surfels = self.grid.unpacked(self.packed, np.argsort(order))  # in the given order
         self.R = Rotation.random(random_state=seed).as_matrix()
         self.t = rng.uniform(-3, 15, 3)
         self.log_scale, self.offset = rng.uniform(-0.05, 0.05), rng.uniform(-0.1, 0.1)

@@ -32,6 +32,10 @@ def held_at(grid, positions):
     return kernel.surfels_at((Piece(grid, np.zeros(0, PACKED_SURFEL)),), positions)
 
 
+def filled_cells(grid):
+    return int(np.bitwise_count(grid.blocks["filled"]).sum())
+
+
 def cells_around(grid, surfels, reach_m):
     """Return all cells of the box around each surfel, one cell wider than its reach, each once (n, 3)."""
     half = int(np.ceil(reach_m / grid.cell_m)) + 1
@@ -78,7 +82,42 @@ def test_every_cell_holds_the_surfel_that_a_dense_grid_holds(seed, count, cell_m
     centres = grid.origin_m + (cells + 0.5) * cell_m
     np.testing.assert_array_equal(held_at(grid, centres), expected)
     np.testing.assert_array_equal(surfels_of_cells(grid, cells), expected)
-    assert len(grid.nearest) == (expected >= 0).sum()  # and no cell outside these boxes is filled
+    assert filled_cells(grid) == (expected >= 0).sum()  # and no cell outside these boxes is filled
+
+
+#: Uppermost bit of ``before``: the block is wide.
+WIDE = np.uint64(1 << 63)
+
+
+@pytest.mark.parametrize(
+    ("count", "extent_m", "wide"), [(150, 3.0, False), (500, 6.0, False), (1500, 3.0, True), (400, 1.0, True)]
+)
+def test_blocks_with_few_and_with_many_surfels_hold_the_nearest(count, extent_m, wide):
+    """The cells of a block that has or refers to too many surfels for one byte take three bytes each."""
+    surfels = surfels_at(np.random.default_rng(count).uniform(0, extent_m, (count, 3)))
+    grid, surfels = mapped(surfels, cell_m=0.4, reach_m=1.2)
+    cells = cells_around(grid, surfels, 1.2)
+    expected = dense_grid(surfels, cells, grid, 1.2)
+    np.testing.assert_array_equal(held_at(grid, grid.origin_m + (cells + 0.5) * 0.4), expected)
+    np.testing.assert_array_equal(surfels_of_cells(grid, cells), expected)
+    assert grid.cells_defect() is None
+    assert (grid.blocks["before"] & WIDE > 0).any() == wide
+
+
+def test_the_bytes_of_the_cells_are_as_the_format_says():
+    """Cells of 1 m in blocks of 8 m, worked out by hand. The first surfel is nearest to a cell on each side of the border of its block."""
+    surfels = surfels_at([[9.5, 4.5, 4.5], [7.9, 4.5, 4.5]])
+    packed, order = kernel.packed_surfels(surfels, cell_m=1.0, reach_m=0.7, lattice_m=np.zeros(3))
+    grid = kernel.nearest_grid(packed)
+    np.testing.assert_array_equal(grid.origin_m, 0)
+    np.testing.assert_array_equal(order, [1, 0])  # the surfel of the first block first
+    np.testing.assert_array_equal(grid.cells, [0, 0, 0, 1, 0])  # own; list: number 0; first foreign one, own
+    np.testing.assert_array_equal(grid.blocks["first"], [0, 3])
+    np.testing.assert_array_equal(grid.blocks["own"], [0 << 8 | 1, 1 << 8 | 1])
+    np.testing.assert_array_equal(grid.blocks["before"], [0, sum(2 << 9 * (part - 1) for part in (4, 5, 6, 7))])
+    np.testing.assert_array_equal(np.argwhere(grid.blocks["filled"]), [[0, 7], [1, 3]])
+    assert grid.blocks["filled"][0, 7] == 1 << 48  # the cell 3, 0, 0 of the part
+    assert grid.blocks["filled"][1, 3] == 1 << 0 | 1 << 16
 
 
 @random_maps
@@ -121,7 +160,7 @@ def test_positions_of_many_regions_alternate():
 
 
 def bytes_of(grid):
-    return sum(each.nbytes for each in (grid.slots, grid.regions, grid.blocks, grid.nearest, grid.others))
+    return sum(each.nbytes for each in (grid.slots, grid.regions, grid.blocks, grid.cells, grid.others))
 
 
 def test_two_towns_60_km_apart_take_what_both_take():
@@ -147,8 +186,9 @@ def test_blocks_far_from_every_surfel_take_no_space():
     surfels = surfels_at([[0.0, 0, 0], [100, 0, 0]])
     grid, _ = mapped(surfels, cell_m=0.5, reach_m=1.0)
     assert 2 <= len(grid.regions) <= 16
-    assert len(grid.blocks) == (grid.regions["row"] > 0).sum() <= 16
-    assert len(grid.nearest) == np.bitwise_count(grid.blocks["filled"]).sum() <= 2 * 5**3
+    assert len(grid.blocks) == np.bitwise_count(grid.regions["has"]).sum() <= 16
+    assert filled_cells(grid) <= 2 * 5**3
+    assert len(grid.cells) == filled_cells(grid)  # one byte each: no cell refers to a surfel of another block
 
 
 def test_surfels_beyond_the_numbers_of_the_regions_are_refused():

@@ -111,7 +111,7 @@ def test_regions_that_are_left_out_have_nothing_to_draw(seed, heading, pitch, ro
 def test_a_map_without_regions_draws_an_empty_picture():
     grid, surfels, _ = packed_map(wall(5), cell_m=0.4, reach_m=1.2)
     empty = NearestGrid(
-        grid.origin_m, grid.cell_m, grid.slots, grid.regions[:0], grid.blocks[:0], grid.nearest[:0], grid.others
+        grid.origin_m, grid.cell_m, grid.slots, grid.regions[:0], grid.blocks[:0], grid.cells[:0], grid.others
     )
     found = render((Piece(empty, surfels[:0]),), T_map_camera=AHEAD, camera=CAMERA, size_m=0.1, reach_m=40.0)
     np.testing.assert_array_equal(found, np.zeros((24, 32)))

@@ -114,9 +114,9 @@ def test_the_kernel_hits_the_same_surfels_as_numpy(seed, focal_px):
     ray = camera.rays_of_pixels().reshape(-1, 3)
     x, n = (surfels_of(cloud)[name].astype(float) @ R_BODY_OPTICAL for name in ("xyz", "normal"))
     off = (n * x).sum(axis=1)
-    with np.errstate(divide="ignore"):  # a packed normal may be exactly perpendicular to a ray
+    with np.errstate(divide="ignore", invalid="ignore"):  # a packed normal may be exactly perpendicular to a ray
         z = off / (ray @ n.T)
-    apart2 = ((ray[:, None] * z[..., None] - x) ** 2).sum(axis=2)
+        apart2 = ((ray[:, None] * z[..., None] - x) ** 2).sum(axis=2)
     flat = np.abs(off) < s.grazing * np.linalg.norm(x, axis=1)
     there = (apart2 <= s.radius_m**2) & ~flat & (x[:, 2] >= s.nearest_m) & (x[:, 2] <= s.reach_m)
     first = np.where(there, z, np.inf).min(axis=1, keepdims=True)
