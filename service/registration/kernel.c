@@ -610,11 +610,10 @@ static inline void enter(int32_t surfel, const int64_t *low, const int64_t *high
         }
 }
 
-/* Builds one region; its key is set. ``xyz`` (n, 3): positions of all surfels, surfels' frame, m. ``which`` (count): rows of the surfels
- * whose reach may touch the region, ascending. Work memory for
- * all cells of the region: ``surfel_of`` and ``distance2``. Writes to the region which blocks have filled cells, these blocks to ``blocks``, and
- * the surfels of their filled cells to ``nearest``. The field ``first`` of a block counts from the start of ``nearest``, until
- * streetfix_pack_cells. Returns the number of blocks. */
+/* Builds one region: its key is set, all else is 0. ``xyz`` (n, 3): positions of all surfels, surfels' frame, m. ``which`` (count): rows of
+ * the surfels whose reach may touch the region, ascending. Work memory for all cells of the region: ``surfel_of`` and ``distance2``. Writes
+ * to the region which blocks have filled cells, these blocks to ``blocks``, and the surfels of their filled cells to ``nearest``. The field
+ * ``first`` of a block counts from the start of ``nearest``, until streetfix_pack_cells. Returns the number of blocks. */
 WIDE int64_t streetfix_build_region(const Grid *g, const float *xyz, const int32_t *which, int64_t count, double reach, int32_t *surfel_of,
                                     float *distance2, Region *region, Block *blocks, int32_t *nearest)
 {
