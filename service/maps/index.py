@@ -165,7 +165,7 @@ class ScannedCopy:
         copy.train(vectors_of(numbers[:: -(-len(numbers) // _SAMPLE)]))
         for first in range(0, len(numbers), _CHUNK):
             copy.add(vectors_of(numbers[first : first + _CHUNK]))
-        _faiss.downcast_VectorTransform(copy.chain.at(0)).PCAMat.resize(0)  # all axes: only training needs them
+        axes.PCAMat.resize(0)  # all axes, which only training needs
         return cls(copy, _mean_of(axes))
 
     def write(self, path: Path) -> None:

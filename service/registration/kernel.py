@@ -320,7 +320,11 @@ class NearestGrid:
         The regions must share out the blocks. The library checks nothing when it looks a cell up.
         """
         found = _library().streetfix_check_cells(
-            self.regions.ctypes.data, len(self.regions), self.blocks.ctypes.data, self.cells.ctypes.data, len(self.cells)
+            self.regions.ctypes.data,
+            len(self.regions),
+            self.blocks.ctypes.data,
+            self.cells.ctypes.data,
+            len(self.cells),
         )
         return _CELLS_DEFECTS[found]
 
