@@ -1,8 +1,9 @@
+from functools import cache
 from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial import cKDTree
 
@@ -126,6 +127,7 @@ def test_a_cell_that_refers_outside_the_surfels_of_its_block_is_refused(arrays, 
     assert len(SurfelMap.from_arrays(arrays).surfels) == len(arrays["surfels"])
 
 
+@cache
 def crowded_arrays():
     """Return a map whose blocks list foreign surfels, and some of which are wide."""
     surfels, rng = np.zeros(3000, SURFEL), np.random.default_rng(0)
@@ -136,7 +138,7 @@ def crowded_arrays():
 @pytest.mark.parametrize("wide", [False, True])
 def test_a_listed_number_outside_the_surfels_of_its_region_is_refused(wide):
     """The number of a foreign surfel in a narrow block, and of a cell in a wide one."""
-    arrays = crowded_arrays()
+    arrays = {name: array.copy() for name, array in crowded_arrays().items()}
     region, blocks = arrays["grid_regions"][0], arrays["grid_blocks"]
     is_wide = blocks["before"] >> np.uint64(63) > 0
     of_region = int(region["block"]) + np.arange(int(np.bitwise_count(region["has"]).sum()))
@@ -153,9 +155,37 @@ def test_a_listed_number_outside_the_surfels_of_its_region_is_refused(wide):
             refused(arrays, "grid_cells", "a number is outside the surfels of its region")
 
 
+#: Arrays that the kernel reads without checks.
+GRID = [name for name in REQUIRED if name.startswith("grid_") and name != "grid_frame"]
+
+
+@given(
+    damage=st.lists(
+        st.tuples(st.sampled_from(GRID), st.floats(0, 1, exclude_max=True), st.binary(min_size=1, max_size=8)),
+        min_size=1,
+        max_size=3,
+    )
+)
+@settings(max_examples=300, deadline=None)
+def test_a_damaged_grid_is_refused_or_refers_to_surfels_of_the_map(damage):
+    """Wherever bytes change, no lookup leaves the arrays. ``make sanitize`` sees each read outside of them."""
+    arrays = dict(crowded_arrays())
+    for name, share, written in damage:
+        changed = bytearray(crowded_arrays()[name].tobytes())
+        at = int(share * len(changed))
+        changed[at : at + len(written)] = written[: len(changed) - at]
+        arrays[name] = np.frombuffer(bytes(changed), arrays[name].dtype).copy()
+    try:
+        found = SurfelMap.from_arrays(arrays)
+    except BundleError:
+        return
+    rows = surfels_at(found.pieces, np.random.default_rng(0).uniform(-3, 33, (500, 3)))
+    assert -1 <= rows.min() <= rows.max() < 3000
+
+
 @pytest.mark.parametrize("size", [-1, 1])
 def test_cells_that_are_cut_or_too_long_are_refused(size):
-    arrays = crowded_arrays()
+    arrays = dict(crowded_arrays())
     arrays["grid_cells"] = np.resize(arrays["grid_cells"], len(arrays["grid_cells"]) + size)
     refused(arrays, "grid_blocks", "the bytes of the cells are not shared out")
 
