@@ -23,7 +23,7 @@ TESTS = tuple(
     f"tests/unit/{folder}/test_{name}.py"
     for folder, names in {
         "imaging": ("decode_depth", "resample", "level", "png16", "ros_depth", "view_grid"),
-        "registration": ("align", "gradients", "nearest_grid", "points", "rays", "render", "visibility"),
+        "registration": ("align", "gradients", "nearest_grid", "points", "rays", "render", "surfel_map", "visibility"),
         "mapping": ("passes", "voxel_map"),
     }.items()
     for name in names

@@ -23,50 +23,50 @@
 #define KEY_BITS 18   /* bits of a region's number along each axis */
 #define NUMBER_BITS 9 /* bits of a block's number in its region, and of the number of filled cells before a part */
 #define OWN_BITS 8    /* bits of the number of a block's own surfels */
-#define NARROW 256    /* most surfels that the cells of a block refer to with one byte */
+#define NARROW 256    /* most surfels of a narrow block: its own, and the foreign ones that its cells refer to */
 #define FOREIGN_BYTES 2 /* bytes of a foreign surfel's number in a narrow block */
 #define WIDE_BYTES 3  /* bytes of a cell in a wide block */
 
 /* A block with at least one filled cell. A filled cell has a surfel in reach of its centre.
  *
- * A cell of a narrow block has one byte. Smaller numbers than that of the block's own surfels are these surfels. The numbers after them are
- * foreign surfels, which the bytes before ``first`` list backwards. A cell of a wide block has the number of its surfel in the region. */
+ * A cell of a narrow block has one byte. If the block has n surfels, a byte below n is one of them, and a byte n + k is foreign surfel k.
+ * The bytes before ``first`` list the foreign surfels backwards. A cell of a wide block has the number of its surfel in the region. */
 typedef struct {
     uint64_t filled[PARTS]; /* bit (x * 4 + y) * 4 + z of a part: the cell is filled */
     uint64_t before;        /* number of filled cells before parts 1 to 7, NUMBER_BITS each; uppermost bit: the block is wide */
     uint32_t first;         /* byte of its first filled cell in cells, counted from the first byte of the region */
-    uint32_t own;           /* lower OWN_BITS: number of its own surfels; others: the first one, counted from that of the region */
+    uint32_t own; /* lower OWN_BITS: number of its own surfels; others: the first one, counted from that of the region. 0: wide */
 } Block;
 
 /* A region with at least one block or surfel. It numbers its surfels block by block, then those of other regions that are in
  * ``others``. */
 typedef struct {
-    int64_t key;                 /* numbers of the region along x, y, z: (x << 36) + (y << 18) + z */
+    int64_t key; /* numbers of the region along x, y, z: (x << 36) + (y << 18) + z */
     int64_t block, surfel, other; /* rows of the region's first block in blocks, surfel in surfels, and entry in others */
-    int64_t cells;               /* first byte of its blocks in cells */
-    uint32_t surfels, others;    /* number of its surfels, and of its entries in others */
-    uint64_t has[REGION_WORDS];  /* bit of each block's number: it has filled cells. The rows of these blocks are ascending by number */
+    int64_t cells; /* first byte of its blocks in cells */
+    uint32_t surfels, others; /* number of its surfels, and of its entries in others */
+    uint64_t has[REGION_WORDS]; /* bit of each block's number: it has filled cells. The rows of these blocks are ascending by number */
     uint16_t before[REGION_WORDS]; /* number of such blocks before each word of has */
 } Region;
 
 /* Surfels with their regions: a map of one bundle, or what a tile has of a tiled map. */
 typedef struct {
-    int64_t slot_bits;    /* binary logarithm of the number of slots */
+    int64_t slot_bits; /* binary logarithm of the number of slots */
     const int32_t *slots; /* hash table with linear probing: row of a region in regions, -1 for none */
     const Region *regions;
     const Block *blocks;
-    const uint8_t *cells;        /* of each filled cell: the surfel nearest to its centre; see Block */
-    const int32_t *others;       /* rows in surfels */
+    const uint8_t *cells; /* of each filled cell: the surfel nearest to its centre; see Block */
+    const int32_t *others; /* rows in surfels */
     const PackedSurfel *surfels;
-    const uint8_t *served;       /* 1 for a region that this piece gives to the grid; 0: it gives all */
-    int64_t shift[3];            /* regions along x, y, z from the corner of the grid to that of this piece */
-    int64_t first;               /* number of its first surfel among those of all pieces */
+    const uint8_t *served; /* 1 for a region that this piece gives to the grid; 0: it gives all */
+    int64_t shift[3]; /* regions along x, y, z from the corner of the grid to that of this piece */
+    int64_t first; /* number of its first surfel among those of all pieces */
 } Piece;
 
 /* The regions of all pieces together. Each region comes from one piece. */
 typedef struct {
     double ox, oy, oz, cell; /* corner of the grid and edge of a cell, m */
-    int64_t count;           /* number of pieces */
+    int64_t count; /* number of pieces */
     const Piece *pieces;
 } Grid;
 
@@ -75,17 +75,17 @@ typedef struct {
     int64_t count;
     const float *xyz[3]; /* level frame, m */
     const float *ray[3]; /* unit vectors from the camera, level frame */
-    const float *sigma;  /* standard deviation along the ray, m */
+    const float *sigma; /* standard deviation along the ray, m */
     const float *weight; /* factor of a point's information */
-    const float *q;      /* depth / (focal length x baseline), 1/px; 0: no disparity offset */
+    const float *q; /* depth / (focal length x baseline), 1/px; 0: no disparity offset */
 } Query;
 
 typedef struct {
     int64_t iterations;
-    double reach;             /* largest distance between a point and its surfel, m */
+    double reach; /* largest distance between a point and its surfel, m */
     double robust_first, robust_last; /* width of the robust kernel in the first and in the last iteration, m */
-    double surface;           /* roughness of all surfaces, m */
-    double prior_weight;      /* information of the priors, as a share of the summed weight of all points */
+    double surface; /* roughness of all surfaces, m */
+    double prior_weight; /* information of the priors, as a share of the summed weight of all points */
     double tilt, height, position, scale, offset; /* standard deviations of the priors: rad, m, m, log scale, px */
     double free_scale, free_offset; /* 0 or 1 */
 } Options;
@@ -103,7 +103,7 @@ typedef struct {
 #define SETTLED_RAD 1.7e-3 /* and turned it by less than this, rad (0.1 degrees) */
 /* Points per batch. Their memory is prefetched together. Otherwise the kernel would mostly wait for memory (decision 0025). */
 #define BATCH_SIZE 32
-#define LANES 8  /* partial sums side by side; the same number on every machine, so all machines give the same answer */
+#define LANES 8 /* partial sums side by side; the same number on every machine, so all machines give the same answer */
 
 /* Solves A x = b in place by Cholesky decomposition; returns 0 if A is not positive definite. */
 static int solve(double A[UNKNOWNS][UNKNOWNS], double b[UNKNOWNS])
@@ -154,7 +154,7 @@ static void rotate_left(double R[9], const double w_in[3])
 /* A batch of points: their positions, surfels, gradients, residuals and weights. */
 typedef struct {
     double y[3][BATCH_SIZE], at[3][BATCH_SIZE], stretch[BATCH_SIZE]; /* R y, and R y + t (surfels' frame, m); s / (1 + o q) */
-    float local[3][BATCH_SIZE];             /* position in the region, steps */
+    float local[3][BATCH_SIZE]; /* position in the region, steps */
     const PackedSurfel *surfel[BATCH_SIZE]; /* 0 for none */
     /* distance from the surfel (surfels' frame, m), its normal, its thickness (m); 0, 0 0 1 and 1 for none */
     float off[3][BATCH_SIZE], normal[3][BATCH_SIZE], thickness[BATCH_SIZE];
@@ -167,7 +167,7 @@ typedef struct {
 typedef struct {
     int64_t key[RECENT * RECENT * RECENT];
     const Region *region[RECENT * RECENT * RECENT]; /* EMPTY_REGION if the grid has no such region */
-    const Piece *piece[RECENT * RECENT * RECENT];   /* the piece that has it */
+    const Piece *piece[RECENT * RECENT * RECENT]; /* the piece that has it */
 } Recent;
 
 static inline void forget(Recent *recent)
@@ -610,10 +610,10 @@ static inline void enter(int32_t surfel, const int64_t *low, const int64_t *high
         }
 }
 
-/* Builds one region: its key is set, all else is 0. ``xyz`` (n, 3): positions of all surfels, surfels' frame, m. ``which`` (count): rows of
- * the surfels whose reach may touch the region, ascending. Work memory for all cells of the region: ``surfel_of`` and ``distance2``. Writes
- * to the region which blocks have filled cells, these blocks to ``blocks``, and the surfels of their filled cells to ``nearest``. The field
- * ``first`` of a block counts from the start of ``nearest``, until streetfix_pack_cells. Returns the number of blocks. */
+/* Builds one region: its key is set, and ``has`` is 0. ``xyz`` (n, 3): positions of all surfels, surfels' frame, m. ``which`` (count): rows
+ * of the surfels whose reach may touch the region, ascending. Work memory for all cells of the region: ``surfel_of`` and ``distance2``.
+ * Writes to the region which blocks have filled cells, these blocks to ``blocks``, and the surfels of their filled cells to ``nearest``. The
+ * field ``first`` of a block counts from the start of ``nearest``, until streetfix_pack_cells. Returns the number of blocks. */
 WIDE int64_t streetfix_build_region(const Grid *g, const float *xyz, const int32_t *which, int64_t count, double reach, int32_t *surfel_of,
                                     float *distance2, Region *region, Block *blocks, int32_t *nearest)
 {
@@ -664,9 +664,10 @@ WIDE int64_t streetfix_build_region(const Grid *g, const float *xyz, const int32
     return found;
 }
 
-/* Writes the cells of a region. ``numbers``: of the surfel of each filled cell, as the region numbers them, block by block. ``starts``
- * (REGION_BLOCKS + 1): number of the first surfel of each block. ``place``: work memory for each number, -1 before and after. Needs up to
- * WIDE_BYTES for each cell in ``cells``, and FOREIGN_BYTES * NARROW for each block. Returns the number of bytes. */
+/* Writes the cells of a region, and completes its blocks: ``first``, ``own``, and which are wide. ``numbers``: of the surfel of each filled
+ * cell, as the region numbers them, block by block. ``starts`` (REGION_BLOCKS + 1): number of the first surfel of each block. ``place``: work
+ * memory for each number, -1 before and after. Needs up to WIDE_BYTES for each cell in ``cells``, and FOREIGN_BYTES * NARROW for each block.
+ * Returns the number of bytes. */
 int64_t streetfix_pack_cells(const Region *region, Block *blocks, const uint32_t *starts, const uint32_t *numbers, int32_t *place,
                              uint8_t *cells)
 {
@@ -709,7 +710,7 @@ int64_t streetfix_pack_cells(const Region *region, Block *blocks, const uint32_t
 }
 
 /* What is wrong with the blocks of a grid (streetfix_check_cells); kernel.py has the texts. */
-enum { SOUND, FILLED_WRONG, CELLS_NOT_SHARED, SURFELS_OUTSIDE, CELL_OUTSIDE };
+enum { SOUND, FILLED_WRONG, FIRST_WRONG, REGION_WRONG, SIZE_WRONG, SURFELS_OUTSIDE, CELL_OUTSIDE };
 
 /* Checks a block whose bytes begin at ``cells`` + ``at``, of ``size``. Writes where they end. */
 static inline int64_t check_block(const Region *region, const Block *block, const uint8_t *cells, int64_t at, int64_t size, int64_t *end)
@@ -721,8 +722,8 @@ static inline int64_t check_block(const Region *region, const Block *block, cons
     }
     if (!filled) return FILLED_WRONG;
     const int64_t first = region->cells + block->first, list = first - at, width = is_wide(block) ? WIDE_BYTES : 1;
-    if (list < 0 || list % FOREIGN_BYTES || (is_wide(block) && list) || first > size || size - first < filled * width)
-        return CELLS_NOT_SHARED;
+    if (list < 0 || list % FOREIGN_BYTES || (is_wide(block) && list) || first > size) return FIRST_WRONG;
+    if (size - first < filled * width) return SIZE_WRONG;
     const int64_t own = block->own & ((1 << OWN_BITS) - 1), foreign = list / FOREIGN_BYTES, start = block->own >> OWN_BITS;
     if (start + own > region->surfels) return SURFELS_OUTSIDE;
     const int64_t numbered = (int64_t)region->surfels + region->others;
@@ -741,7 +742,7 @@ WIDE int64_t streetfix_check_cells(const Region *regions, int64_t count, const B
 {
     int64_t at = 0;
     for (const Region *region = regions; region < regions + count; region++) {
-        if (region->cells != at) return CELLS_NOT_SHARED;
+        if (region->cells != at) return REGION_WRONG;
         int64_t rows = 0;
         for (int word = 0; word < REGION_WORDS; word++) rows += __builtin_popcountll(region->has[word]);
         for (int64_t row = 0; row < rows; row++) {
@@ -749,7 +750,7 @@ WIDE int64_t streetfix_check_cells(const Region *regions, int64_t count, const B
             if (found != SOUND) return found;
         }
     }
-    return at == size ? SOUND : CELLS_NOT_SHARED;
+    return at == size ? SOUND : SIZE_WRONG;
 }
 
 /* Position of a surfel from the corner of the grid, in steps. */
@@ -884,10 +885,10 @@ void streetfix_render(const PackedSurfel *surfels, const Cube *cubes, int64_t cu
 
 typedef struct {
     double hit, new, removed, outlier; /* weights of the beam model's components */
-    double roughness_m, span_m;        /* roughness of surfaces; length over which removed and outlier are uniform */
+    double roughness_m, span_m; /* roughness of surfaces; length over which removed and outlier are uniform */
     double threshold_sigmas, margin_m; /* a point is off the surface beyond threshold_sigmas x sigma + margin_m */
-    double unmapped_m;                 /* depth assumed for an empty pixel */
-    double scale, offset;              /* registered with the pose */
+    double unmapped_m; /* depth assumed for an empty pixel */
+    double scale, offset; /* registered with the pose */
 } Beam;
 
 /* Compares measured depths with a rendered depth image. at: index of each point's pixel; z, sigma: depth along the optical axis and its
@@ -936,8 +937,8 @@ const LayoutEntry streetfix_layout[] = {
     LAYOUT_STRUCT(Block), LAYOUT_FIELD(Block, filled), LAYOUT_FIELD(Block, before), LAYOUT_FIELD(Block, first),
     LAYOUT_FIELD(Block, own),
     LAYOUT_STRUCT(Region), LAYOUT_FIELD(Region, key), LAYOUT_FIELD(Region, block), LAYOUT_FIELD(Region, surfel),
-    LAYOUT_FIELD(Region, other), LAYOUT_FIELD(Region, cells), LAYOUT_FIELD(Region, surfels), LAYOUT_FIELD(Region, others), LAYOUT_FIELD(Region, has),
-    LAYOUT_FIELD(Region, before),
+    LAYOUT_FIELD(Region, other), LAYOUT_FIELD(Region, cells), LAYOUT_FIELD(Region, surfels), LAYOUT_FIELD(Region, others),
+    LAYOUT_FIELD(Region, has), LAYOUT_FIELD(Region, before),
     LAYOUT_STRUCT(Piece), LAYOUT_FIELD(Piece, slot_bits), LAYOUT_FIELD(Piece, slots), LAYOUT_FIELD(Piece, regions),
     LAYOUT_FIELD(Piece, blocks), LAYOUT_FIELD(Piece, cells), LAYOUT_FIELD(Piece, others), LAYOUT_FIELD(Piece, surfels),
     LAYOUT_FIELD(Piece, served), LAYOUT_FIELD(Piece, shift), LAYOUT_FIELD(Piece, first),
@@ -957,7 +958,8 @@ const LayoutEntry streetfix_layout[] = {
     LAYOUT_STRUCT(Beam), LAYOUT_FIELD(Beam, hit), LAYOUT_FIELD(Beam, new), LAYOUT_FIELD(Beam, removed),
     LAYOUT_FIELD(Beam, outlier), LAYOUT_FIELD(Beam, roughness_m), LAYOUT_FIELD(Beam, span_m), LAYOUT_FIELD(Beam, threshold_sigmas),
     LAYOUT_FIELD(Beam, margin_m), LAYOUT_FIELD(Beam, unmapped_m), LAYOUT_FIELD(Beam, scale), LAYOUT_FIELD(Beam, offset),
-    LAYOUT_CONSTANT(UNKNOWNS), LAYOUT_CONSTANT(BLOCK), LAYOUT_CONSTANT(KEY_BITS), LAYOUT_CONSTANT(NUMBER_BITS), LAYOUT_CONSTANT(REGION), LAYOUT_CONSTANT(STEPS), LAYOUT_CONSTANT(BATCH_SIZE),
+    LAYOUT_CONSTANT(UNKNOWNS), LAYOUT_CONSTANT(BLOCK), LAYOUT_CONSTANT(KEY_BITS), LAYOUT_CONSTANT(NUMBER_BITS),
+    LAYOUT_CONSTANT(REGION), LAYOUT_CONSTANT(STEPS), LAYOUT_CONSTANT(BATCH_SIZE),
     LAYOUT_END,
 };
 /* clang-format on */

@@ -46,7 +46,7 @@ LIBRARY = Path(__file__).with_name("_kernel.so")
 SURFEL = np.dtype([("xyz", "<f4", (3,)), ("normal", "<f4", (3,)), ("thickness_m", "<f4"), ("points", "<u4")])
 #: A surfel as a map holds it (``NearestGrid.unpacked``). xyz: position from the corner of its region, ``STEPS`` along the edge of a cell.
 #: normal: octahedral map of the unit vector (Meyer et al., Eurographics Symposium on Rendering 2010), two signed numbers of 12 bits.
-#: thickness, points: codes.
+#: The first is in the lower bits. thickness, points: codes.
 PACKED_SURFEL = np.dtype([("xyz", "<u2", (3,)), ("normal", "u1", (3,)), ("thickness", "u1"), ("points", "u1")])
 #: Steps of a packed position along the edge of a cell.
 STEPS = 1024
@@ -55,7 +55,7 @@ CUBE = np.dtype([("corner", "<f8", (3,)), ("first", "<i8"), ("count", "<i8")])
 #: A block of the lookup grid with at least one filled cell. A filled cell has a surfel in reach of its centre.
 #: filled: 64 bits for each part, bit (x * 4 + y) * 4 + z for a cell. before: number of filled cells before parts 1 to 7, 9 bits each; its
 #: uppermost bit is set for a wide block. first: byte of its first filled cell in ``NearestGrid.cells``, counted from ``cells`` of its
-#: region. own: number of its own surfels (lower 8 bits), and the first one, counted from ``surfel`` of its region (24 bits).
+#: region. own: number of its own surfels (lower 8 bits), and the first one, counted from ``surfel`` of its region (24 bits); 0 for wide.
 GRID_BLOCK = np.dtype([("filled", "<u8", (8,)), ("before", "<u8"), ("first", "<u4"), ("own", "<u4")])
 #: A region with at least one block or surfel. key: its numbers along x, y and z, 18 bits each, x first. block, surfel, other: rows of its
 #: first block in ``NearestGrid.blocks``, of its first surfel, and of its first entry in ``NearestGrid.others``. cells: its first byte in
@@ -266,9 +266,11 @@ def numbers_of_regions(keys: NDArray[np.int64]) -> NDArray[np.int64]:
 _CELLS_DEFECTS = (
     None,
     ("blocks", "a number of filled cells is wrong"),
-    ("blocks", "the bytes of the cells are not shared out one after the other"),
+    ("blocks", "a first cell does not follow the cells of the block before"),
+    ("regions", "the bytes of the cells are not shared out one after the other"),
+    ("cells", "its length is not what the blocks need"),
     ("blocks", "the surfels of a block are outside those of its region"),
-    ("cells", "a number is outside the surfels of its region"),
+    ("cells", "a number is outside the surfels of its block or region"),
 )
 
 
@@ -690,8 +692,8 @@ def _numbered(
     foreign, place = np.unique(rows[outside], return_inverse=True)
     if own + len(foreign) > _MOST_NUMBERED:
         raise StreetfixError(
-            f"a cube of 64 cells of the lookup grid has {own + len(foreign):,} surfels instead of at most {_MOST_NUMBERED:,}; "
-            "build the map with larger voxels (--voxel-m)"
+            f"a region of the lookup grid (64 cells along its edge) refers to {own + len(foreign):,} surfels, at most {_MOST_NUMBERED:,}; "
+            "build the map with larger voxels (--voxel)"
         )
     numbers[outside] = own + place
     return numbers.astype(np.uint32), foreign

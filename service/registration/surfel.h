@@ -22,7 +22,8 @@ typedef struct {
 /* A surfel as a map holds it, in 11 bytes. Its position counts from the corner of its region. */
 typedef struct __attribute__((packed)) {
     uint16_t xyz[3];           /* steps; STEPS along the edge of a cell */
-    uint8_t normal[3]; /* octahedral map of the unit vector (Meyer et al. 2010): two signed numbers of NORMAL_BITS, the lower first */
+    uint8_t normal
+        [3]; /* octahedral map of the unit vector (Meyer et al. 2010): two signed numbers of NORMAL_BITS, the first in the lower bits */
     uint8_t thickness, points; /* codes: the root of the thickness, the logarithm of the number of points; 0 is 0 */
 } PackedSurfel;
 

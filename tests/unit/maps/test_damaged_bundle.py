@@ -194,7 +194,9 @@ def test_a_grid_that_points_outside_the_surfels_is_refused(bundle_copy: Path, tm
     cells = np.load(bundle_copy / "cloud" / "grid_cells.npy")
     cells[:] = 255
     replace_file(bundle_copy, "cloud/grid_cells.npy", npy_bytes(tmp_path / "a.npy", cells))
-    with pytest.raises(BundleError, match=r"cloud/grid_cells\.npy: a number is outside the surfels of its region"):
+    with pytest.raises(
+        BundleError, match=r"cloud/grid_cells\.npy: a number is outside the surfels of its block or region"
+    ):
         MapBundle.open(bundle_copy)
 
 

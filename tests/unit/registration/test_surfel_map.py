@@ -122,7 +122,7 @@ def test_a_cell_that_refers_outside_the_surfels_of_its_block_is_refused(arrays, 
     first = int(arrays["grid_regions"]["cells"][region]) + int(block["first"])
     referred = int(block["own"] & 255) + int(block["first"]) // 2  # the list of the first block begins with its region
     arrays["grid_cells"][first] = referred
-    refused(arrays, "grid_cells", "a number is outside the surfels of its region")
+    refused(arrays, "grid_cells", "a number is outside the surfels of its block or region")
     arrays["grid_cells"][first] = referred - 1
     assert len(SurfelMap.from_arrays(arrays).surfels) == len(arrays["surfels"])
 
@@ -152,7 +152,7 @@ def test_a_listed_number_outside_the_surfels_of_its_region_is_refused(wide):
         if is_sound:
             assert len(SurfelMap.from_arrays(arrays).surfels) == 3000
         else:
-            refused(arrays, "grid_cells", "a number is outside the surfels of its region")
+            refused(arrays, "grid_cells", "a number is outside the surfels of its block or region")
 
 
 #: Arrays that the kernel reads without checks.
@@ -187,7 +187,7 @@ def test_a_damaged_grid_is_refused_or_refers_to_surfels_of_the_map(damage):
 def test_cells_that_are_cut_or_too_long_are_refused(size):
     arrays = dict(crowded_arrays())
     arrays["grid_cells"] = np.resize(arrays["grid_cells"], len(arrays["grid_cells"]) + size)
-    refused(arrays, "grid_blocks", "the bytes of the cells are not shared out")
+    refused(arrays, "grid_cells", "its length is not what the blocks need")
 
 
 @pytest.mark.parametrize("beyond", [True, False])
@@ -234,8 +234,8 @@ def test_a_hash_table_that_loses_a_region_is_refused(arrays, value, what):
         ("grid_regions", "others", 10**9, "the .* entries of grid_others are not shared out"),
         ("grid_regions", "cells", -1, "the bytes of the cells are not shared out"),
         ("grid_regions", "cells", 2**63 - 1, "the bytes of the cells are not shared out"),
-        ("grid_blocks", "first", 0, "the bytes of the cells are not shared out"),
-        ("grid_blocks", "first", 2**32 - 1, "the bytes of the cells are not shared out"),
+        ("grid_blocks", "first", 0, "a first cell does not follow"),
+        ("grid_blocks", "first", 2**32 - 1, "a first cell does not follow"),
         ("grid_blocks", "before", 400, "a number of filled cells is wrong"),
         ("grid_blocks", "filled", 0, "a number of filled cells is wrong"),
         ("grid_blocks", "own", 2**32 - 1, "the surfels of a block are outside those of its region"),
@@ -243,7 +243,7 @@ def test_a_hash_table_that_loses_a_region_is_refused(arrays, value, what):
 )
 def test_a_level_of_the_grid_that_points_outside_is_refused(arrays, name, field, value, what):
     arrays[name][field][-1] = value
-    refused(arrays, "grid_blocks" if field == "cells" else name, what)
+    refused(arrays, name, what)
 
 
 @pytest.mark.parametrize(
@@ -337,7 +337,7 @@ def test_a_region_with_more_surfels_than_two_bytes_number():
 def test_a_region_with_more_surfels_than_a_cell_can_refer_to_is_refused(monkeypatch):
     monkeypatch.setattr(kernel, "_MOST_NUMBERED", 10)
     surfels = np.zeros(11, SURFEL)
-    with pytest.raises(StreetfixError, match=r"has 11 surfels instead of at most 10; build the map with larger voxels"):
+    with pytest.raises(StreetfixError, match=r"refers to 11 surfels, at most 10; build the map with larger voxels"):
         SurfelMap.prepare(np.zeros(3), surfels)
 
 
