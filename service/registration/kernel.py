@@ -603,8 +603,8 @@ def packed_surfels(
         surfels: of the map, (S,) of ``SURFEL``, in any order.
         cell_m: edge of a cell of their lookup grid, m.
         reach_m: largest distance from a surfel to the centre of a cell that refers to it, m.
-        lattice_m: a position in the surfels' frame. The corner of the grid lies whole regions away from it, so that grids with one lattice
-            fit together. None puts the corner just below the surfels.
+        lattice_m: a position in the surfels' frame, m. The corner of the grid lies whole regions away from it, so that grids with one
+            lattice fit together. None puts the corner just below the surfels.
 
     Returns:
         The packed surfels, and their rows in ``surfels`` (S,).

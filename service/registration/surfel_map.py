@@ -104,10 +104,10 @@ class SurfelMap:
         Args:
             surfels: as of ``prepare``.
             brightness: as of ``prepare``.
-            lattice_m: as of ``kernel.packed_surfels``.
+            lattice_m: as of ``kernel.packed_surfels``, m.
 
         Returns:
-            The packed surfels, and their intensities as a map holds them.
+            The packed surfels, and their intensities as a map holds them (S,).
         """
         found, order = packed_surfels(surfels, cell_m=CELL_M, reach_m=REACH_M, lattice_m=lattice_m)
         if brightness is None:
@@ -144,10 +144,10 @@ class SurfelMap:
         return self.grid.unpacked(self.surfels, rows)
 
     def brightness_of(self, rows: NDArray[np.integer[Any]]) -> Float32[NDArray[np.float32], " *n"] | None:
-        """Return the intensities of some surfels in the sensor's unit, NaN where unknown; None if the map has no intensities.
+        """Return the intensities of some surfels in the sensor's unit, NaN where unknown; None if the map has none.
 
         Args:
-            rows: rows in ``surfels``, of any shape.
+            rows: rows in ``surfels``, (n,) or of another shape, which the result has too.
         """
         return None if self.brightness is None else self.brightness[rows].astype(np.float32)
 

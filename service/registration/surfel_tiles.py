@@ -87,10 +87,10 @@ class JoinedSurfels:
         return found
 
     def brightness_of(self, rows: NDArray[np.integer[Any]]) -> Float32[NDArray[np.float32], " *n"] | None:
-        """Return the intensities of some surfels in the sensor's unit, NaN where unknown; None if no tile has intensities.
+        """Return the intensities of some surfels in the sensor's unit, NaN where unknown; None if no tile has any.
 
         Args:
-            rows: numbers of surfels, of any shape.
+            rows: numbers of surfels, (n,) or of another shape, which the result has too.
         """
         if not self.has_brightness:
             return None
