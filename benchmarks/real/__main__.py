@@ -79,6 +79,8 @@ def main() -> None:
         if not arguments.only or name in arguments.only:
             print(f"--- {name}", flush=True)
             measure(report, arguments)
+            if arguments.only:  # an interrupted run keeps the parts that it has finished, and the rows of all others
+                report.write()
     print(report.write())
 
 
