@@ -27,7 +27,7 @@ _ECE, _AFTER, _WRONG, _REFUSED = 0.10, 0.05, 0.02, 0.05
 
 
 #: Said beside the pooled rows.
-_JUDGED_ON = "no real query was fitted, but drive 0005 helped to choose the features (decisions 0137 and 0165)"
+_JUDGED_ON = "No real query was fitted, but drive 0005 helped to choose the features (decisions 0137 and 0165)"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -162,8 +162,8 @@ def pooled_confidence_rows(report: Report, parts: list[JudgedQueries]) -> None:
         np.concatenate([getattr(each, name) for each in parts]) for name in ("outside", "right", "before", "after")
     )
     every = JudgedQueries("all", outside, right, before, after)
-    counts = ", ".join(f"{each.name} {(~each.outside).sum()} and {each.outside.sum()}" for each in parts)
-    told = f"{(~outside).sum()} queries in the map and {outside.sum()} outside it: {counts}; {_JUDGED_ON}"
+    counts = ". ".join(f"{each.name}: {(~each.outside).sum()} and {each.outside.sum()}" for each in parts)
+    told = f"{(~outside).sum()} queries in the map and {outside.sum()} outside it. Of these, {counts}. {_JUDGED_ON}"
     for row, confidence, bar in (("ece", before, _ECE), ("ece_after_rig_calibration", after, _AFTER)):
         value = every.error(confidence)
         report.row(f"real.{row}", value, "share", bar=bar, better="lower", n=len(right), why=told)

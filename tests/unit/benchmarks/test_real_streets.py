@@ -169,7 +169,8 @@ def test_calibration_errors_are_those_of_all_queries_together(tmp_path):
     assert rows["real.ece_after_rig_calibration"]["value"] == pytest.approx(0.15)
     assert [row["holds"] for row in rows.values()] == [False, False]
     assert rows["real.ece"]["why"].startswith(
-        "3 queries in the map and 6 outside it: kitti_0005 2 and 2, kitti_0013 on the map of kitti_0005 0 and 4, kitti_stereo 1 and 0; "
+        "3 queries in the map and 6 outside it. Of these, kitti_0005: 2 and 2. "
+        "kitti_0013 on the map of kitti_0005: 0 and 4. kitti_stereo: 1 and 0. No real query"
     )
     assert "drive 0005 helped to choose the features" in rows["real.ece"]["why"]
 
@@ -271,6 +272,6 @@ def test_all_recordings_take_part_in_the_pooled_error(tmp_path, monkeypatch, ans
     assert rows["real.strangers.accepted"]["value"] == 0.75
     assert rows["real.ece"]["n"] == 13
     assert (
-        "kitti_0013 on the map of kitti_0005 0 and 2, kitti_0005 on the map of kitti_0013 0 and 2, kitti_stereo 1 and 0"
+        "kitti_0013 on the map of kitti_0005: 0 and 2. kitti_0005 on the map of kitti_0013: 0 and 2. kitti_stereo: 1 and 0."
         in (rows["real.ece"]["why"])
     )
