@@ -9,13 +9,12 @@ from rich.console import Console
 from model_training.cli.progress import bars
 from model_training.cli.tile_options import EngineOption, WorkersOption, refuse_without_tiles
 from model_training.datasets.dataset import MOST_SURVEY_STD_DEG, MOST_SURVEY_STD_M
-from model_training.datasets.stored_survey import StoredSurvey, dataset_at
+from model_training.datasets.stored_survey import dataset_at
 from model_training.mapping.build import build_map, describe, require_new
 from model_training.mapping.build_tiled import build_tiled
 from model_training.mapping.calibration_file import calibration_for
 from model_training.mapping.frame_choice import in_chosen_frame
 from model_training.mapping.settings import BuildSettings
-from model_training.mapping.survey import kept_scans
 from model_training.mapping.tiles import require_tile_edge
 from model_training.stock import CALIBRATION, ENCODER
 from model_training.tasks.engines import require_engine
@@ -168,8 +167,6 @@ def command(
             survey_std_m=survey_std_m,
             survey_std_deg=survey_std_deg,
         )
-        if isinstance(opened, StoredSurvey) and tile_m is None:
-            opened.fetch(kept_scans(opened, settings)[1], report)
         if tile_m is None:
             manifest = build_map(opened, encoder, out, settings, overwrite=overwrite, report=report)
         else:

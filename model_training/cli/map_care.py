@@ -12,7 +12,8 @@ from rich.console import Console
 
 from model_training.cli.progress import bars
 from model_training.cli.tile_options import EngineOption, WorkersOption, refuse_without_tiles
-from model_training.datasets.dataset import Dataset, require_map_first
+from model_training.datasets.dataset import require_map_first
+from model_training.datasets.stored_survey import dataset_at
 from model_training.mapping.build import describe
 from model_training.mapping.diff import diff_of, difference_png
 from model_training.mapping.info import info_of
@@ -147,8 +148,11 @@ def merge(
 def update(
     bundle: _Bundle,
     dataset: Annotated[
-        Path,
-        typer.Argument(help="Dataset folder with a survey. One of another georeference is moved into the map's frame."),
+        str,
+        typer.Argument(
+            help="Dataset folder with a survey, or its URL in object storage, as s3://BUCKET/PATH (extra `store`). One of another "
+            "georeference is moved into the map's frame."
+        ),
     ],
     out: _Out,
     replace: Annotated[
@@ -176,20 +180,21 @@ def update(
     Examples:
       streetfix map update maps/town data/may --replace-area block.geojson --out maps/town-may
       streetfix map update maps/town-tiled data/may --workers 4 --out maps/town-may
+      streetfix map update maps/town-tiled s3://bucket/surveys/may --out maps/town-may
     """
     if replace and replace_area is not None:
         raise typer.BadParameter("give --replace or --replace-area, not both")
-    require_map_first(bundle, dataset, "map update")
+    require_map_first(bundle, Path(dataset), "map update")
     updating: Callable[..., Manifest] = update_map
     if read_manifest(bundle).tiles:
         warn = partial(typer.echo, err=True)
         updating = partial(update_tiled, engine=engine or "local", workers=workers, warn=warn)
     else:
         refuse_without_tiles(engine, workers, remedy=f"{bundle} is a map of one bundle, so omit the option")
-    with bars() as report:
+    with bars() as report, dataset_at(dataset, out) as opened:
         made = updating(
             bundle,
-            Dataset(dataset),
+            opened,
             out,
             replace_covered=replace,
             replace_area=replace_area,

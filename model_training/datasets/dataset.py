@@ -329,6 +329,11 @@ class Dataset:
         """Return the name of the dataset."""
         return self.description.name
 
+    @property
+    def place(self) -> str:
+        """Where the dataset is, for error messages: the folder, or the URL in object storage."""
+        return str(self.folder)
+
     def in_frame(self, georeference: Mapping[str, Any] | None) -> Self:
         """Return this dataset with poses, ground truth and streets in another map frame.
 

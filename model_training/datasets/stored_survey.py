@@ -167,6 +167,11 @@ class _Stored(Dataset):
 
     source: StoredSource
 
+    @property
+    def place(self) -> str:
+        """URL of the dataset, for error messages."""
+        return self.source.url
+
     def _has_survey(self) -> bool:
         return True  # StoredSource.found requires it, and the file may not have been fetched yet
 
@@ -295,6 +300,21 @@ class StoredSurveyPart(SurveyPart, _Stored):
     def release(self) -> None:
         """Delete the fetched files."""
         shutil.rmtree(self.folder, ignore_errors=True)
+
+
+def fetch_if_stored(dataset: Dataset, numbers: NDArray[np.int64], report: Report = lambda *_: None) -> None:
+    """Fetch scans of a dataset in object storage, several at a time. Those of a folder are there.
+
+    Args:
+        dataset: the dataset.
+        numbers: numbers of the scans (n,).
+        report: called with the fetched MB.
+
+    Raises:
+        DatasetError: a scan has changed since the command began, or cannot be read or written.
+    """
+    if isinstance(dataset, StoredSurvey):
+        dataset.fetch(numbers, report)
 
 
 def source_of(dataset: Dataset, numbers: NDArray[np.int64]) -> PartSource:

@@ -36,12 +36,12 @@ def in_chosen_frame(dataset: D, frame: str | None, *, tiled: bool) -> D:
         return dataset
     if own is None:
         raise DatasetError(
-            f"{dataset.folder}/dataset.json: georeference is null, so its place in the frame {frame!r} is unknown; import the survey "
+            f"{dataset.place}/dataset.json: georeference is null, so its place in the frame {frame!r} is unknown; import the survey "
             f"with its georeference, or give --frame {SURVEY}",
             field="georeference",
         )
     if frame == GLOBAL:
-        of_dataset = georeference_of(own, f"{dataset.folder}/dataset.json")
+        of_dataset = georeference_of(own, f"{dataset.place}/dataset.json")
         positions = dataset.survey_poses()[:, :3, 3]
         # An empty survey has no middle. The build refuses it.
         return dataset.in_frame(asdict(global_frame(of_dataset, positions))) if len(positions) else dataset

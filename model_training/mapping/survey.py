@@ -98,7 +98,7 @@ def kept_scans(dataset: Dataset, settings: BuildSettings) -> tuple[NDArray[np.fl
     poses = dataset.survey_poses()
     if not len(poses):
         raise DatasetError(
-            f"{dataset.folder}/survey/poses.txt is empty, so no map can be built; import the survey again",
+            f"{dataset.place}/survey/poses.txt is empty, so no map can be built; import the survey again",
             field="survey",
         )
     return poses, thinned(poses, settings.spacing_m)
@@ -115,7 +115,7 @@ def require_poses_within(cloud: VoxelMap, poses: NDArray[np.float64], dataset: D
     Raises:
         DatasetError: a pose is too far away. The message names the file, the scan and its distance.
     """
-    cloud.require_within(poses[:, :3, 3], lambda number: f"{dataset.folder}/survey/poses.txt: scan {number}")
+    cloud.require_within(poses[:, :3, 3], lambda number: f"{dataset.place}/survey/poses.txt: scan {number}")
 
 
 def thinned(poses: NDArray[np.float64], spacing_m: float) -> NDArray[np.int64]:
@@ -210,7 +210,7 @@ def sampled_survey(
     seen: NDArray[np.bool_] = measured / len(chosen) > SEEN_SHARE
     if not seen.any():
         raise DatasetError(
-            f"{dataset.folder}: the scans have no points between {grid.elevation_bottom_deg:g} and {grid.elevation_top_deg:g} degrees "
+            f"{dataset.place}: the scans have no points between {grid.elevation_bottom_deg:g} and {grid.elevation_top_deg:g} degrees "
             f"of elevation within {grid.max_range_m:g} m: check units and axes (metres, z up)",
             field="survey",
         )

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from model_training.datasets.dataset import Dataset
+from model_training.datasets.stored_survey import fetch_if_stored
 from model_training.mapping.area import Area, covered_by, polygon_of
 from model_training.mapping.build import tool_versions
 from model_training.mapping.cloud import with_cloud
@@ -151,6 +152,7 @@ def update_map(
         replaced=replacement.key,
     )
     with work_beside(out, key) as work:
+        fetch_if_stored(dataset, kept, report)  # each stage reads them again
         stages = ResumedStages(work, dataset, kept, settings, report)
         require_rows(stages.rows_seen(bundle.grid), bundle, dataset)
         drive = SurveyTraversal(dataset, stages.poses(poses), kept, settings, encoder, bundle.grid, bundle.rows_seen)
@@ -222,7 +224,7 @@ def in_frame_of(dataset: Dataset, bundle: Map) -> Dataset:
     of_map, of_drive = bundle.manifest.georeference, dataset.description.georeference
     if (of_map is None) != (of_drive is None):
         raise DatasetError(
-            f"{dataset.folder}: the georeference of the dataset is {of_drive or 'missing'}, that of the map {bundle.path} is "
+            f"{dataset.place}: the georeference of the dataset is {of_drive or 'missing'}, that of the map {bundle.path} is "
             f"{of_map or 'missing'}, so the survey has no known place in the map. If its poses are in the frame of the map, write the "
             "georeference of the map into dataset.json. Else import the survey with its georeference",
             field="georeference",
@@ -246,7 +248,7 @@ def require_rows(rows_seen: NDArray[np.bool_], bundle: Map, dataset: Dataset) ->
     missing = int((bundle.rows_seen & ~rows_seen).sum())
     if missing > 0.1 * bundle.rows_seen.sum():
         raise DatasetError(
-            f"{dataset.folder}: the LiDAR of the survey does not see {missing} of the {int(bundle.rows_seen.sum())} rows of the view grid "
+            f"{dataset.place}: the LiDAR of the survey does not see {missing} of the {int(bundle.rows_seen.sum())} rows of the view grid "
             "that the map uses; use a LiDAR with at least the same vertical field of view, or build a separate map (build-map)",
             field="survey",
         )

@@ -1,6 +1,7 @@
 """Update one tile of a tiled map. The result depends on nothing but the task, so any process on any machine may update it."""
 
 import json
+import shutil
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -9,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
-from model_training.datasets.survey_part import FolderSource, SurveyPart
+from model_training.datasets.survey_part import PartSource, SurveyPart
 from model_training.mapping import engines
 from model_training.mapping.build import Report, tool_versions
 from model_training.mapping.build_tile import THREADS, WAIT_S, Share, require_planned, shares_of_stages
@@ -42,7 +43,7 @@ class TileUpdate:
     Attributes:
         old: folder of the tile. For a square without a tile, that of a tile to take the settings from.
         beside: None for a tile of the map. For a new one, folders of the tiles whose clouds reach into its own.
-        source: the dataset with the survey, in the frame of the map.
+        source: where the scans of the tile are. Their poses are in the frame of the map.
         settings: settings of the tile.
         numbers: indices of the scans that the tile reads in the survey (K,).
         poses: their given T_map_lidar (K, 4, 4).
@@ -54,7 +55,7 @@ class TileUpdate:
 
     old: Path
     beside: tuple[Path, ...] | None
-    source: FolderSource
+    source: PartSource
     settings: BuildSettings
     numbers: NDArray[np.int64]
     poses: NDArray[np.float64]
@@ -63,13 +64,16 @@ class TileUpdate:
     replace_area: Path | None
     streets: dict[str, Any] | None
 
-    def survey(self) -> SurveyPart:
+    def survey(self, scratch: Path) -> SurveyPart:
         """Return the scans that the tile reads.
+
+        Args:
+            scratch: folder for files that come from a store.
 
         Raises:
             DatasetError: the dataset cannot be opened.
         """
-        return self.source.part(self.numbers, self.poses, scratch=self.source.folder)
+        return self.source.part(self.numbers, self.poses, scratch=scratch)
 
     def replacement(self) -> Replacement:
         """Return what the survey replaces.
@@ -79,8 +83,11 @@ class TileUpdate:
         """
         return Replacement.of(self.replace_covered, self.replace_area)
 
-    def key(self) -> str:
+    def key(self, survey: SurveyPart) -> str:
         """Return a hash of all inputs, as this process finds them. Scans that the tile does not read do not count.
+
+        Args:
+            survey: the scans that the tile reads.
 
         Raises:
             DatasetError: the scans or the polygon file cannot be read.
@@ -90,7 +97,7 @@ class TileUpdate:
         planned = (part.square, part.area.beside, part.survey_scans, part.order.tolist(), part.travelled_m.tolist())
         places = (part.plan.at_scan.tolist(), sorted(part.plan.on_way.items()))
         return key_of(
-            self.survey(),
+            survey,
             read_manifest(self.old).encoder_sha256,
             self.settings,
             threads=THREADS,
@@ -127,6 +134,11 @@ class UpdateTask:
         return self.update.numbers
 
     @property
+    def scratch(self) -> Path:
+        """Folder for scans that come from a store, while the tile is updated."""
+        return self.folder.with_name(f".{self.folder.name}.scans")
+
+    @property
     def no_place_left(self) -> Path:
         """File that says that the tile has no place left. Then there is no bundle."""
         return self.folder.with_name(f"{self.folder.name}.none")
@@ -159,20 +171,25 @@ def update_tile(task: UpdateTask, share: Share = lambda _: None) -> None:
         share: called with the finished share of the tile.
 
     Raises:
-        DatasetError: a scan is damaged, or the polygon file is not valid.
+        DatasetError: a scan is damaged or cannot be fetched, or the polygon file is not valid.
         BundleError: the old tile is damaged, the new one cannot be written, or this process sees other inputs than the one that planned
             the tiles.
     """
     update = task.update
     with threadpool_limits(limits=THREADS), work_beside(task.folder, task.key, wait_s=WAIT_S) as work:
         if task.is_finished:  # by an earlier attempt that this one has just waited for
+            shutil.rmtree(task.scratch, ignore_errors=True)
             return
-        require_planned(task.name, update.key(), task.key, inputs="other scans, another map, another polygon")
+        survey = update.survey(task.scratch)
+        require_planned(task.name, update.key(survey), task.key, inputs="other scans, another map, another polygon")
         bundle = MapBundle.open(update.old)
         content, cloud = _before(update, bundle)
         if len(update.numbers):
+            survey.prepare()
             report = shares_of_stages(update.settings, share)
-            content, cloud = updated(*_traversal(update, bundle, work, report), content, cloud, update.replacement())
+            content, cloud = updated(
+                *_traversal(update, survey, bundle, work, report), content, cloud, update.replacement()
+            )
         else:
             content = _without_polygon(update, content, cloud)
         if len(content.T_map_place):
@@ -182,13 +199,14 @@ def update_tile(task: UpdateTask, share: Share = lambda _: None) -> None:
             write_bundle(task.folder, content)
         else:
             task.no_place_left.touch()
+        survey.release()
 
 
 def _traversal(
-    update: TileUpdate, bundle: MapBundle, work: BuildCache, report: Report
+    update: TileUpdate, survey: SurveyPart, bundle: MapBundle, work: BuildCache, report: Report
 ) -> tuple[ResumedStages, SurveyTraversal]:
     """Return the stages of the update, and the part of the survey that the tile reads."""
-    survey, kept = update.survey(), np.arange(len(update.numbers))
+    kept = np.arange(len(update.numbers))
     stages = ResumedStages(work, survey, kept, update.settings, report, update.part)
     encoder = Encoder.open(bundle.encoder_bytes(), threads=THREADS)
     poses = stages.poses(update.poses)

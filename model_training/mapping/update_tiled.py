@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from model_training.datasets.dataset import Dataset
-from model_training.datasets.survey_part import FolderSource
+from model_training.datasets.stored_survey import source_of
 from model_training.mapping.area import Area
 from model_training.mapping.build_tile import THREADS
 from model_training.mapping.join import joined_streets
@@ -117,7 +117,7 @@ def update_tiled(
                     beside=None
                     if own
                     else tuple(path / tiles[each].folder for each in tiles if part.area.may_share(each)),
-                    source=FolderSource(dataset.folder.resolve(), dataset.frame),
+                    source=source_of(dataset, numbers),
                     settings=BuildSettings.of_map(read_manifest(folder), passes_vote=passes_vote),
                     numbers=numbers,
                     poses=poses[numbers],
@@ -126,7 +126,7 @@ def update_tiled(
                     replace_area=None if replace_area is None else replace_area.resolve(),
                     streets=streets,
                 )
-                tile_key = update.key()
+                tile_key = update.key(update.survey(dataset.folder))
                 found.append(UpdateTask(update, tile_key, folder_of(work, part.square, tile_key)))
                 report("planning tiles", done + 1, len(changed))
             return found

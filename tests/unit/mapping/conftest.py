@@ -95,14 +95,23 @@ def half_maps(halves: tuple[Dataset, Dataset], map_of: Callable[..., Path]) -> t
 
 
 @pytest.fixture
-def survey_url(small_dataset: Any, s3: dict[str, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> str:
-    """Return the URL of a copy of the survey on an S3 server. Processes that start later find the credentials."""
+def upload(s3: dict[str, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[Dataset], str]:
+    """Return a function that copies a survey to an S3 server and returns its URL. Later processes find the credentials."""
     for key, value in s3.items():
         monkeypatch.setenv(key, value)
-    url = f"s3://{BUCKET}/{tmp_path.name}/survey"
-    remote = Remote.open(url)
-    for name in ("dataset.json", "streets.geojson", "survey/poses.txt"):
-        remote.put(name, small_dataset.folder / name)
-    for name, *_ in small_dataset.scan_files():
-        remote.put(f"survey/scans/{name}", small_dataset.folder / "survey" / "scans" / name)
-    return url
+
+    def uploaded(dataset: Dataset) -> str:
+        url = f"s3://{BUCKET}/{tmp_path.name}/survey"
+        remote = Remote.open(url)
+        for name in ("dataset.json", "streets.geojson", "survey/poses.txt"):
+            remote.put(name, dataset.folder / name)
+        for name, *_ in dataset.scan_files():
+            remote.put(f"survey/scans/{name}", dataset.folder / "survey" / "scans" / name)
+        return url
+
+    return uploaded
+
+
+@pytest.fixture
+def survey_url(small_dataset: Dataset, upload: Callable[[Dataset], str]) -> str:
+    return upload(small_dataset)

@@ -18,6 +18,7 @@ from model_training.mapping.voxel_map import VOXEL, VoxelMap
 from service.cli import main as command_line
 from service.errors import BundleError
 from service.maps.byte_planes import Columns
+from service.maps.manifest import read_manifest
 from service.maps.reader import MapBundle
 from service.maps.writer import write_bundle
 from service.registration.surfel_map import SurfelMap
@@ -229,6 +230,15 @@ def test_merge_and_update_as_a_person_calls_them(run, half_maps, small_dataset, 
     code, _, err = run("merge", *half_maps, "--out", tmp_path / "merged")
     assert (code, "already" in err) == (1, True)
     assert run("merge", *half_maps, "--out", tmp_path / "merged", "--overwrite")[0] == 0
+
+
+def test_a_map_of_one_bundle_takes_a_survey_in_object_storage(run, half_maps, small_dataset, survey_url, tmp_path):
+    for place, out in ((survey_url, "stored"), (small_dataset.folder, "local")):
+        code, _, err = run("update", half_maps[0], place, "--out", tmp_path / out)
+        assert code == 0, err
+    stored, local = (read_manifest(tmp_path / out) for out in ("stored", "local"))
+    assert stored.version == local.version
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["local", "stored"]
 
 
 def test_both_ways_to_replace_at_once_are_wrong_usage(run, half_maps, small_dataset, tmp_path):

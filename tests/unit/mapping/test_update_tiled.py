@@ -9,6 +9,7 @@ import re
 import shutil
 import subprocess
 import sys
+from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -21,6 +22,7 @@ from typer.testing import CliRunner
 
 from model_training.cli.map_care import app
 from model_training.datasets.dataset import Dataset, scan_path, write_tum
+from model_training.datasets.stored_survey import dataset_at
 from model_training.mapping import engines
 from model_training.mapping.build import build_map
 from model_training.mapping.build_tiled import build_tiled
@@ -396,6 +398,23 @@ def test_a_killed_update_keeps_its_finished_tiles(
     assert done == sorted(done)
 
 
+@pytest.mark.usefixtures("serial")
+def test_a_survey_in_object_storage_gives_the_same_map(
+    whole: Path, second: Dataset, upload: Callable[[Dataset], str], undisturbed: dict[str, bytes], tmp_path: Path
+) -> None:
+    """Each tile fetches its own scans and deletes them, so one tile's scans at most are there."""
+    out, there = tmp_path / "m", list[int]()
+
+    def report(stage: str, *_: int) -> None:
+        there.append(len(list(work_folder(out).glob(".tile_*.scans"))))
+
+    with dataset_at(upload(second), out) as survey:
+        update_tiled(whole, survey, out, report=report)
+    assert files_of(out) == undisturbed
+    assert max(there) == 1
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["m"]
+
+
 def test_processes_give_the_same_bytes_although_one_is_killed(
     whole: Path, second: Dataset, undisturbed: dict[str, bytes], tmp_path: Path
 ) -> None:
@@ -465,11 +484,11 @@ def tasks_of(whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> An
     return planned
 
 
-def test_a_task_can_be_sent_to_another_process(second: Dataset, tasks_of: Any) -> None:
+def test_a_task_can_be_sent_to_another_process(second: Dataset, tasks_of: Any, tmp_path: Path) -> None:
     task = tasks_of(second)[0]
     again = pickle.loads(pickle.dumps(task))  # noqa: S301  # of this test
     assert (again.key, again.folder, again.name) == (task.key, task.folder, task.name)
-    assert again.update.key() == task.key
+    assert again.update.key(again.update.survey(tmp_path)) == task.key
     assert all(path.is_absolute() for path in (task.update.old, task.update.source.folder, task.folder))
 
 
@@ -650,6 +669,32 @@ def test_the_command_updates_a_tiled_map(whole: Path, second: Dataset, tmp_path:
     assert "map town" in found.output
     again = CliRunner().invoke(app, ["diff", str(whole), str(tmp_path / "m")])
     assert "2 changed, 1 kept" in again.output
+
+
+@pytest.mark.usefixtures("serial")
+def test_the_command_reads_a_survey_in_object_storage(
+    whole: Path, second: Dataset, upload: Callable[[Dataset], str], undisturbed: dict[str, bytes], tmp_path: Path
+) -> None:
+    found = CliRunner().invoke(app, ["update", str(whole), upload(second), "--out", str(tmp_path / "m")])
+    assert found.exit_code == 0, found.output
+    assert files_of(tmp_path / "m") == undisturbed
+
+
+@pytest.mark.usefixtures("serial")
+def test_an_error_names_the_url_of_the_survey(
+    whole: Path, second: Dataset, upload: Callable[[Dataset], str], tmp_path: Path
+) -> None:
+    moved = Dataset(shutil.copytree(second.folder, tmp_path / "moved"))
+    described = json.loads((moved.folder / "dataset.json").read_text())
+    described["georeference"] = {"latitude_deg": 48.0, "longitude_deg": 9.0, "altitude_m": 0.0, "heading_deg": 0.0}
+    (moved.folder / "dataset.json").write_text(json.dumps(described))
+    url = upload(moved)
+    with (
+        pytest.raises(DatasetError, match=f"{re.escape(url)}: the georeference of the dataset is .* of the map"),
+        dataset_at(url, tmp_path / "m") as survey,
+    ):
+        update_tiled(whole, survey, tmp_path / "m")
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["moved"]
 
 
 def test_the_options_of_the_command_reach_the_engine(
