@@ -4,7 +4,7 @@ Frames are read one at a time. No function loads a whole traversal.
 """
 
 import json
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from copy import copy
 from dataclasses import dataclass, replace
@@ -54,6 +54,8 @@ TUM_LINE = "`timestamp x y z qx qy qz qw` (seconds, metres, unit quaternion)"
 
 #: Name, size in bytes and modification time in nanoseconds of a scan's file.
 ScanFile = tuple[str, int, int]
+#: Progress callback: stage, number done, number of all.
+Report = Callable[[str, int, int], None]
 
 #: Upper limits of ``SurveyAccuracy``.
 MOST_SURVEY_STD_M, MOST_SURVEY_STD_DEG = 5.0, 5.0
@@ -409,6 +411,17 @@ class Dataset:
         """
         stamps, poses = read_tum(self.folder / "survey" / "poses.txt")
         return stamps, poses if self.frame is None else self.frame.poses(poses)
+
+    def fetch(self, numbers: NDArray[np.int64], report: Report = lambda *_: None) -> None:  # noqa: ARG002
+        """Bring scans to this machine before several stages read them. Those of a folder are there.
+
+        Args:
+            numbers: numbers of the scans (n,).
+            report: called with the fetched MB.
+
+        Raises:
+            DatasetError: a scan cannot be fetched.
+        """
 
     def scan(self, number: int) -> NDArray[np.float32]:
         """Return a scan (n, 4): x, y, z in the LiDAR frame (m) and intensity.

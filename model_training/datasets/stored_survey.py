@@ -16,7 +16,7 @@ from uuid import uuid4
 import numpy as np
 from numpy.typing import NDArray
 
-from model_training.datasets.dataset import Dataset, ScanFile, Transforms, scan_path
+from model_training.datasets.dataset import Dataset, Report, ScanFile, Transforms, scan_path
 from model_training.datasets.frames import MovedFrame
 from model_training.datasets.survey_part import FolderSource, PartSource, SurveyPart
 from service.errors import BundleError, DatasetError
@@ -27,9 +27,6 @@ DATASET = Content("a dataset", "copy the dataset there (docs/maps.md)", "dataset
 _DESCRIPTION, _STREETS, _POSES, _SCANS = "dataset.json", "streets.geojson", "survey/poses.txt", "survey/scans"
 _LOCK, _STATE = "lock", "state"
 _MB = 10**6
-
-#: Progress callback: stage, number done, number of all.
-Report = Callable[[str, int, int], None]
 
 
 @dataclass(frozen=True, slots=True)
@@ -300,21 +297,6 @@ class StoredSurveyPart(SurveyPart, _Stored):
     def release(self) -> None:
         """Delete the fetched files."""
         shutil.rmtree(self.folder, ignore_errors=True)
-
-
-def fetch_if_stored(dataset: Dataset, numbers: NDArray[np.int64], report: Report = lambda *_: None) -> None:
-    """Fetch scans of a dataset in object storage, several at a time. Those of a folder are there.
-
-    Args:
-        dataset: the dataset.
-        numbers: numbers of the scans (n,).
-        report: called with the fetched MB.
-
-    Raises:
-        DatasetError: a scan has changed since the command began, or cannot be read or written.
-    """
-    if isinstance(dataset, StoredSurvey):
-        dataset.fetch(numbers, report)
 
 
 def source_of(dataset: Dataset, numbers: NDArray[np.int64]) -> PartSource:

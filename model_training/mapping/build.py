@@ -14,7 +14,6 @@ from pathlib import Path
 import numpy as np
 
 from model_training.datasets.dataset import Dataset, Transforms
-from model_training.datasets.stored_survey import fetch_if_stored
 from model_training.mapping.calibration_file import calibration_for
 from model_training.mapping.cloud import prepared, with_cloud
 from model_training.mapping.join import of_places
@@ -75,7 +74,7 @@ def build_map(
     apart: Set[int] = set() if calibration is None else held_out(len(kept))
     key = key_of(dataset, encoder.sha256, settings, threads=threads, held_out=len(apart))
     with work_beside(out, key) as work:
-        fetch_if_stored(dataset, kept, report)  # each stage reads them again
+        dataset.fetch(kept, report)  # each stage reads them again
         stages = ResumedStages(work, dataset, kept, settings, report)
         # Rows of the view grid, and poses of the scans.
         grid = ViewGrid(rows=encoder.rows, columns=encoder.columns)

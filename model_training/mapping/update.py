@@ -9,7 +9,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from model_training.datasets.dataset import Dataset
-from model_training.datasets.stored_survey import fetch_if_stored
 from model_training.mapping.area import Area, covered_by, polygon_of
 from model_training.mapping.build import tool_versions
 from model_training.mapping.cloud import with_cloud
@@ -152,7 +151,7 @@ def update_map(
         replaced=replacement.key,
     )
     with work_beside(out, key) as work:
-        fetch_if_stored(dataset, kept, report)  # each stage reads them again
+        dataset.fetch(kept, report)  # each stage reads them again
         stages = ResumedStages(work, dataset, kept, settings, report)
         require_rows(stages.rows_seen(bundle.grid), bundle, dataset)
         drive = SurveyTraversal(dataset, stages.poses(poses), kept, settings, encoder, bundle.grid, bundle.rows_seen)
