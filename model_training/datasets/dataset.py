@@ -412,7 +412,7 @@ class Dataset:
         stamps, poses = read_tum(self.folder / "survey" / "poses.txt")
         return stamps, poses if self.frame is None else self.frame.poses(poses)
 
-    def fetch(self, numbers: NDArray[np.int64], report: Report = lambda *_: None) -> None:  # noqa: ARG002
+    def fetch(self, numbers: NDArray[np.int64], report: Report = lambda *_: None) -> None:
         """Bring scans to this machine before several stages read them. Those of a folder are there.
 
         Args:
