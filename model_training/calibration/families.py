@@ -151,6 +151,10 @@ FAMILIES = (
     Family("livox", CameraPlan(width=640, height=480, horizontal_deg=90.0), 1.2, ("stereo",), "livox_mid_360", 1.0, 1.5, _SLOW),
     # Four cameras around the vehicle.
     Family("four_cameras", CameraPlan(width=640, height=400, horizontal_deg=90.0), 1.5, ("stereo",), "hdl_32", 2.5, 1.8, _CAR, cameras=4),
+    # Cameras near the ground and high above it: a quadruped, a delivery robot and a bus.
+    Family("quadruped", CameraPlan(width=640, height=480, horizontal_deg=85.0), 0.25, ("stereo",), "hdl_32", 1.0, 1.6, _SLOW),
+    Family("courier", CameraPlan(width=640, height=480, horizontal_deg=80.0), 0.4, ("precise",), "os1_64", 1.5, 1.8, _SLOW),
+    Family("bus", CameraPlan(width=800, height=450, horizontal_deg=95.0), 3.4, ("stereo",), "os1_128", 2.0, 1.9, _CAR),
 )  # fmt: skip
 
 

@@ -34,6 +34,7 @@ from service.scoring.candidates import Candidate, Refined
 from service.scoring.confirmation import Confirmation, confirm
 from service.scoring.measured import MeasuredFrame, measure, merged_points
 from service.scoring.photometry import BrightnessScorer, PhotometrySettings
+from service.scoring.ray_evidence import RayEvidence, ray_evidence
 from service.scoring.similarity import similarity_of
 from service.scoring.structure import StructureScorer
 from service.scoring.support import LocalScoreWeights, PoseScorer, SupportWeights, scorers_of
@@ -158,6 +159,7 @@ def refine(
         points=len(points),
         variance_inflation=variance_inflation(final.pose.information, final.scatter),
         confirmation=final.confirmation,
+        ray_evidence=final.ray_evidence,
         covariance_at=covariance_at,
     )
 
@@ -192,7 +194,7 @@ def _systematic_covariance(bundle: Map, frames: tuple[EncodedFrame, ...]) -> _Co
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Adjusted:
-    """The final pose, the scatter of its patches' gradients, its comparison with poses next to it, and its covariance.
+    """The final pose, the scatter of its patches' gradients, its comparison with poses next to it and with the map, and its covariance.
 
     The covariance contains no systematic errors.
     """
@@ -201,6 +203,7 @@ class _Adjusted:
     T_map_camera: Transform
     scatter: Float64[NDArray[np.float64], "8 8"]
     confirmation: Confirmation
+    ray_evidence: RayEvidence
     covariance: _Covariance
 
 
@@ -234,7 +237,8 @@ def _adjusted(
             along_residual=confirmation.along_residual,
         )
         covariance = covariance_of(pose.information, scatter, noise, heading, OF_RAYS, stability)
-    return _Adjusted(pose, T_map_camera, scatter, confirmation, covariance)
+    evidence = ray_evidence(raycaster, scorer.structure.measured, pose)
+    return _Adjusted(pose, T_map_camera, scatter, confirmation, evidence, covariance)
 
 
 def _starts(

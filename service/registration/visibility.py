@@ -195,6 +195,24 @@ class SurfelRaycaster:
             self._results[key] = self._cast(T_map_camera, camera)
         return self._results[key]
 
+    def depth(self, T_map_camera: Transform, camera: PinholeCamera) -> Float64[NDArray[np.float64], "H W"]:
+        """Return the depth (along the optical axis) at which each pixel's ray meets the plane of its surfel, m; 0 for none.
+
+        Args:
+            T_map_camera: pose of the camera in the surfels' frame.
+            camera: intrinsics of the small image.
+        """
+        found = self.intersect(T_map_camera, camera).ravel()
+        hit = np.flatnonzero(found >= 0)
+        surfels = self.cloud.unpacked(found[hit])
+        rays = camera.rays_of_pixels().reshape(-1, 3)[hit] @ T_map_camera[:3, :3].T
+        normal = surfels["normal"].astype(np.float64)
+        # A ray that meets a disc is not parallel to its plane (``DiscSettings.grazing``).
+        distance = ((surfels["xyz"] - T_map_camera[:3, 3]) * normal).sum(axis=1)
+        depth_m = np.zeros(found.size)
+        depth_m[hit] = np.maximum(distance / (rays * normal).sum(axis=1), 0.0)
+        return depth_m.reshape(camera.height, camera.width)
+
     def _cast(self, T_map_camera: Transform, camera: PinholeCamera) -> Int32[NDArray[np.int32], "H W"]:
         collection = next((each for each in self._collections if each.covers(T_map_camera, camera)), None)
         if collection is None:

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from service.geometry.rigid import Transform
 from service.registration.register import Registered
 from service.scoring.confirmation import Confirmation
+from service.scoring.ray_evidence import RayEvidence
 
 #: Two candidates are rivals beyond this distance or this angle. Adjacent positions on one street are not rivals.
 RIVAL_M, RIVAL_RAD = 3.0, float(np.deg2rad(30.0))
@@ -60,6 +61,7 @@ class Refined:
         points: number of registered points, over all frames.
         variance_inflation: how much the image patches disagree about the best pose: ratio of variances to those of their noise.
         confirmation: comparison of the best pose with poses next to it.
+        ray_evidence: comparison of the depth with the map along the rays of the best pose.
         covariance_at: function that computes the covariance of a candidate without ray adjustment: of every one but the best.
     """
 
@@ -69,6 +71,7 @@ class Refined:
     points: int
     variance_inflation: float
     confirmation: Confirmation
+    ray_evidence: RayEvidence
     covariance_at: Callable[[Candidate], Float64[NDArray[np.float64], "6 6"]]
 
     @property

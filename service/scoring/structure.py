@@ -37,7 +37,7 @@ SHIFTS_PX = (-6, -4, 4, 6)
 #: Pixels, or edges, at which a number counts half. With fewer, inliers tend to 0.5, and contrast and shared edges to 0.
 HALF_PIXELS, _HALF_EDGES = 20.0, 10.0
 #: Smallest divisor of a depth that is corrected by a disparity offset.
-_LEAST_STRETCH = 0.05
+LEAST_STRETCH = 0.05
 
 
 @dataclass(frozen=True, slots=True)
@@ -137,10 +137,19 @@ def depth_edges(z_m: Float32[NDArray[np.float32], "H W"]) -> DepthEdges:
     left, right = z_m[:, :-1], z_m[:, 1:]
     known = (left > 0) & (right > 0)
     rising = np.stack([right > (1 + JUMP) * left, left > (1 + JUMP) * right]) & known
+    return DepthEdges(known, rising, near_edges(rising))
+
+
+def near_edges(rising: Bool[NDArray[np.bool_], "2 H pairs"]) -> Bool[NDArray[np.bool_], "2 H pairs"]:
+    """Extend depth edges by a pixel to the left and to the right.
+
+    Args:
+        rising: edges, as in ``DepthEdges``.
+    """
     near = rising.copy()
     near[:, :, 1:] |= rising[:, :, :-1]
     near[:, :, :-1] |= rising[:, :, 1:]
-    return DepthEdges(known, rising, near)
+    return near
 
 
 def structure_image(
@@ -210,7 +219,7 @@ def corrected(image: StructureImage, *, scale: float, offset: float) -> Float32[
         offset: disparity offset, px.
     """
     # A large negative offset puts a far point behind infinity. The limit keeps the depth finite; such a point is no inlier.
-    stretch = np.maximum(1 + np.float32(offset) * image.per_offset, np.float32(_LEAST_STRETCH))
+    stretch = np.maximum(1 + np.float32(offset) * image.per_offset, np.float32(LEAST_STRETCH))
     z_m: Float32[NDArray[np.float32], "H W"] = image.z_m * np.float32(scale) / stretch
     return z_m
 

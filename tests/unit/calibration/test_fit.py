@@ -23,7 +23,7 @@ from service.maps.calibration import probability, read_calibration
 from service.option_limits import FALSE_ACCEPT_RATE, SAFE_CONFIDENCE
 
 COUNT = len(FEATURES)
-INLIERS, MARGIN = FEATURES.index("mapped_inliers"), FEATURES.index("margin")
+INLIERS, MARGIN = FEATURES.index("static_inliers"), FEATURES.index("margin")
 MEAN, SPREAD = 5.0, 2.0  # of every feature
 
 
@@ -87,7 +87,7 @@ def test_true_probabilities_are_recovered(data, calibration):
 
 def test_whether_the_query_is_in_the_map_does_not_depend_on_competing_candidates(data, calibration):
     used = {term.feature for term in calibration.known.terms}
-    assert "mapped_inliers" in used
+    assert "static_inliers" in used
     assert not used & {*RIVALRY, *UNWEIGHED}
     rivals_differ = data.evidence[:9].copy()
     rivals_differ[:, [FEATURES.index(name) for name in RIVALRY]] = 1e3

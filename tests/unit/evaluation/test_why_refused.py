@@ -89,7 +89,7 @@ def test_evidence_out_of_range_is_named_in_the_order_of_likelihood(calibration_o
 def test_evidence_better_than_the_calibration_data_is_no_reason(calibration_of):
     calibration = calibration_of()
     evidence = np.tile([each.mean for each in calibration.features], (5, 1))
-    for name, deviations in (("margin", 5), ("mapped_inliers", 5), ("contrast", 5), ("through", -5)):
+    for name, deviations in (("margin", 5), ("static_inliers", 5), ("contrast", 5), ("through", -5)):
         evidence[:, FEATURES.index(name)] += deviations * calibration.features[FEATURES.index(name)].std
     assert out_of_range(calibration, evidence) == []
 

@@ -24,6 +24,7 @@ from service.retrieval.prior import Prior
 from service.retrieval.retrieve import EncodedFrame, Retrieved
 from service.scoring.candidates import Candidate, Refined
 from service.scoring.confirmation import Confirmation
+from service.scoring.ray_evidence import RayEvidence
 
 LEVEL = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 SMALL = np.diag([0.01**2] * 6)
@@ -41,7 +42,16 @@ def candidate(x: float, support: float) -> Candidate:
 def found(confidence: float, *places: tuple[float, float], known: float | None = None) -> QueryResult:
     """Return a registration with candidates (x, share of the support)."""
     candidates = tuple(candidate(x, math.log(share)) for x, share in places)
-    refined = Refined(candidates, SMALL, SMALL, 500, 1.0, Confirmation(0.0, 0.2, 1.7, 0.1), lambda _: SMALL)
+    refined = Refined(
+        candidates,
+        SMALL,
+        SMALL,
+        500,
+        1.0,
+        Confirmation(0.0, 0.2, 1.7, 0.1),
+        RayEvidence(0.9, 0.0, 0.3, 0.3),
+        lambda _: SMALL,
+    )
     known = max(confidence, 0.98) if known is None else known
     status: Status = "LOCALIZED" if confidence >= THRESHOLD and places[0][1] > 0.5 else "AMBIGUOUS"
     return QueryResult(Retrieved((), (), None), refined, np.zeros(len(FEATURES)), Decision(status, confidence, known))

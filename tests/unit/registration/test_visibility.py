@@ -54,6 +54,19 @@ def test_every_ray_hits_the_surfel_nearest_to_its_intersection():
     assert away.max() <= 0.1 * np.sqrt(2) + 1e-5
 
 
+def test_depth_is_that_of_the_plane_of_the_surfel():
+    """A wall at 10 m, and one at 5 m that leans: its normal has a slope of 3 to 4, so its depth is 5 + 0.75 times the height."""
+    far, near = wall(10), wall(5, y=(-1, 1), z=(-0.3, 0.3), step=0.1, normal=(0.8, 0.0, -0.6))
+    near["xyz"][:, 0] += 0.75 * near["xyz"][:, 2]
+    cloud, camera = cloud_of(far, near), CAMERA
+    depth_m = SurfelRaycaster(cloud, SETTINGS).depth(looking_ahead(), camera)
+    np.testing.assert_allclose(depth_m[:, :10], 10.0, atol=1e-3)
+    rows = np.arange(22, 26)  # of a ray with a height of t z: z = 5 + 0.75 t z
+    slope = -(rows - camera.cy) / camera.fy
+    np.testing.assert_allclose(depth_m[rows, 31], 5.0 / (1 - 0.75 * slope), atol=5e-3)
+    np.testing.assert_array_equal(SurfelRaycaster(cloud, SETTINGS).depth(looking_ahead(x=100.0), camera), 0.0)
+
+
 def test_near_surfaces_hide_far_ones_and_gaps_do_not():
     cloud = cloud_of(wall(10), wall(5, y=(-1, 1)))
     x = np.round(surfels_of(cloud, intersect(cloud, looking_ahead(), CAMERA))["xyz"][..., 0], 2)

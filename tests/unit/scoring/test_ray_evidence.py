@@ -1,0 +1,155 @@
+from dataclasses import astuple, replace
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from service.geometry.camera import PinholeCamera
+from service.registration.points import PointSettings
+from service.registration.rays import RaySettings
+from service.registration.visibility import SurfelRaycaster
+from service.scoring.measured import measure
+from service.scoring.ray_evidence import RayImage, ray_evidence, ray_evidence_of
+
+#: 60 columns and 40 rows, 1.5 m above the ground. A ray of row r gains (19.5 - r) / 20 m for each metre of depth.
+SHAPE = (40, 60)
+CLIMB = np.repeat((19.5 - np.arange(40)) / 20, 60).reshape(SHAPE)
+CAMERA_M = 1.5
+
+
+def image(z_m, mapped_m, sigma=1e-3):
+    return RayImage(
+        z_m=np.asarray(z_m, float),
+        mapped_m=np.asarray(mapped_m, float),
+        sigma=np.full(SHAPE, sigma),
+        climb=CLIMB,
+        camera_m=CAMERA_M,
+    )
+
+
+def scene(wall_m=10.0, *, columns=(), object_m=5.0, top_m=np.inf):
+    """A ground, a wall behind it, and an object in some columns that is ``top_m`` high."""
+    ground = np.where(CLIMB < 0, CAMERA_M / np.maximum(-CLIMB, 1e-9), np.inf)
+    z = np.minimum(ground, wall_m)
+    for column in columns:
+        covered = object_m * CLIMB[:, column] + CAMERA_M <= top_m
+        z[covered, column] = np.minimum(z[covered, column], object_m)
+    return z
+
+
+#: Rows 0 to 18 of the wall at 10 m are higher than 2 m: 10 (19.5 - r) / 20 > 0.5. Rows 0 to 21 are higher than 0.3 m.
+UPPER_10, RAISED_10 = 19, 22
+
+
+def test_a_right_pose_has_only_inliers():
+    seen = scene()
+    found = ray_evidence_of(image(seen, seen))
+    assert found.static_inliers == pytest.approx((RAISED_10 * 60 + 10) / (RAISED_10 * 60 + 20))
+    assert found.upper_through == 0.0
+
+
+def test_a_wall_that_the_camera_sees_through_is_a_contradiction():
+    """Rows 0 to 17 of a wall at 5 m are at least 2 m high. Each ray ends 5 m behind it."""
+    columns = range(10)
+    found = ray_evidence_of(image(scene(), scene(columns=columns)))
+    others = 50 * UPPER_10
+    assert found.upper_through == pytest.approx(10 * 18 / (10 * 18 + others + 20))
+    # The rays through the wall are above 0.3 m in rows 0 to 21. Rows 18 to 21 of the wall may be a vehicle that left.
+    assert found.static_inliers == pytest.approx((50 * RAISED_10 + 10) / (50 * RAISED_10 + 10 * 18 + 20))
+
+
+def test_a_vehicle_that_left_or_came_is_no_contradiction():
+    """1.8 m high and 5 m away."""
+    without, vehicle = scene(), scene(columns=range(10), top_m=1.8)
+    assert (without != vehicle).any()
+    for seen, mapped in ((without, vehicle), (vehicle, without)):
+        found = ray_evidence_of(image(seen, mapped))
+        assert found.upper_through == 0.0
+        assert found.static_inliers > 0.985
+        assert (found.occlusion_edges, found.upper_occlusion_edges) == (0.0, 0.0)
+
+
+def test_a_new_house_is_a_contradiction():
+    """It stands in front of the map's wall, above the height of a vehicle: those pixels are no inliers."""
+    found = ray_evidence_of(image(scene(columns=range(10)), scene()))
+    high = 10 * 18  # above 2 m at a depth of 5 m
+    assert found.static_inliers == pytest.approx((50 * RAISED_10 + 10) / (50 * RAISED_10 + high + 20))
+    assert found.upper_through == 0.0
+
+
+def test_a_pole_has_an_edge_on_each_side():
+    """Both images show it at the same place, or three columns apart. The pole is 5 m away, and 2 m high or higher in rows 0 to 17.
+
+    An edge needs a difference of 1.25 m. The ground beside the pole is at 30 / (row - 19.5) m, so rows 0 to 24 have edges.
+    """
+    pole, moved = scene(columns=(30,)), scene(columns=(33,))
+    rows, high = 25, 18
+    found = ray_evidence_of(image(pole, pole))
+    assert found.occlusion_edges == pytest.approx(4 * rows / (4 * rows + 20))
+    assert found.upper_occlusion_edges == pytest.approx(4 * high / (4 * high + 20))
+    other = ray_evidence_of(image(pole, moved))
+    assert (other.occlusion_edges, other.upper_occlusion_edges) == (0.0, 0.0)
+
+
+def test_without_a_surface_nothing_is_said():
+    nothing = np.zeros(SHAPE)
+    for seen, mapped in ((nothing, scene()), (scene(), nothing), (nothing, nothing)):
+        assert astuple(ray_evidence_of(image(seen, mapped))) == (0.5, 0.0, 0.0, 0.0)
+
+
+@given(seed=st.integers(0, 2**32 - 1), sigma=st.floats(1e-6, 0.5))
+def test_the_numbers_are_shares(seed, sigma):
+    rng = np.random.default_rng(seed)
+    z, mapped = (np.where(rng.random(SHAPE) < rng.random(), rng.uniform(0.3, 80.0, SHAPE), 0.0) for _ in range(2))
+    found = astuple(ray_evidence_of(image(z, mapped, sigma)))
+    assert np.isfinite(found).all()
+    assert min(found) >= 0
+    assert max(found) < 1
+
+
+@pytest.fixture
+def raycaster(street_map):
+    return SurfelRaycaster(street_map, RaySettings())
+
+
+@pytest.fixture
+def measured(frame_with, matches_at, candidate, raycaster):
+    """Return one frame that measures the street from the pose of ``candidate``."""
+    frame = frame_with(matches_at([(0, 0, 2)], [0], [0.9]))
+    T = frame.pose_of_camera(candidate(xyz=(0.0, 0.0, 1.5)).registered.T_map_level)
+    camera = PinholeCamera(120, 90, 60.0, 60.0, 59.5, 44.5)
+    query = replace(frame.query, depth_m=raycaster.depth(T, camera).astype(np.float32), camera=camera)
+    return measure((replace(frame, query=query),), PointSettings(), focal_baseline_px_m=80.0, is_rig=True)
+
+
+def test_the_map_is_seen_from_the_pose(raycaster, measured, candidate):
+    right, beside, turned = (
+        ray_evidence(raycaster, measured, candidate(xyz=xyz, heading_deg=heading).registered)
+        for xyz, heading in (((0.0, 0.0, 1.5), 0.0), ((0.0, 1.5, 1.5), 0.0), ((0.0, 0.0, 1.5), 20.0))
+    )
+    assert right.static_inliers > 0.95
+    assert right.upper_through < 0.02
+    for wrong in (beside, turned):
+        assert wrong.static_inliers < right.static_inliers - 0.2
+
+
+def test_the_depth_is_corrected_by_scale_and_offset(raycaster, measured, candidate):
+    """A measured inverse depth of q means (q + offset / focal length times baseline) / scale."""
+    pose = candidate(xyz=(0.0, 0.0, 1.5)).registered
+    (one,) = measured
+    expected = ray_evidence(raycaster, measured, pose)
+    inverse = one.picture.inverse
+    shown = np.where(inverse > 0, 1.25 * inverse - 0.5 / 80.0, 0).astype(np.float32)
+    changed = replace(one, picture=replace(one.picture, inverse=np.maximum(shown, 0)))
+    found = ray_evidence(raycaster, (changed,), replace(pose, scale=1.25, offset=0.5))
+    assert astuple(found) == pytest.approx(astuple(expected), abs=0.02)
+    assert ray_evidence(raycaster, (changed,), pose).static_inliers < expected.static_inliers - 0.1
+
+
+def test_frames_are_averaged(raycaster, measured, candidate):
+    pose = candidate(xyz=(0.0, 0.0, 1.5)).registered
+    (one,) = measured
+    blind = replace(one, is_reference=False, picture=replace(one.picture, inverse=np.zeros_like(one.picture.inverse)))
+    expected = 0.5 * (np.array(astuple(ray_evidence(raycaster, measured, pose))) + (0.5, 0.0, 0.0, 0.0))
+    assert astuple(ray_evidence(raycaster, (one, blind), pose)) == pytest.approx(tuple(expected))
