@@ -42,6 +42,9 @@ _TITLES = {
     "iphone": "iPhone with LiDAR",
     "livox": "survey by a Livox",
     "four_cameras": "four cameras around",
+    "quadruped": "stereo near the ground",
+    "courier": "delivery robot",
+    "bus": "stereo of a bus",
 }
 
 

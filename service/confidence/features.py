@@ -188,7 +188,7 @@ class Feature:
 #: ``log_share`` has no weight, because it is a separate rule beside the confidence (``service.confidence.decision``, decision
 #: 0086). ``similarity`` has none, because it depends more on the kind of street than on the place. Real streets lie four
 #: standard deviations below simulated streets (decision 0137). The others without a weight gained nothing on rig families that
-#: were left out of the fit (decisions 0149, 0159 and 0165). They still serve ``reasons``.
+#: were left out of the fit (decisions 0149, 0159, 0165 and 0201). They still serve ``reasons``.
 TABLE: tuple[Feature, ...] = (
     Feature("margin", "nat", "support gap to the best rival", 1,
             lambda e: float(e.support_gaps[1:].min(initial=_MOST_MARGIN)), rivalry=True, ideal=True),
@@ -221,10 +221,10 @@ TABLE: tuple[Feature, ...] = (
             lambda e: e.refined.ray_evidence.static_inliers, ideal=True),
     Feature("upper_through", "1", "share of the rays that pass through the map's surfaces above vehicles and people", -1,
             lambda e: e.refined.ray_evidence.upper_through, ideal=True),
-    Feature("occlusion_edges", "1", "share of the depth edges of more than 1 m that image and map share", 1,
-            lambda e: e.refined.ray_evidence.occlusion_edges),
+    Feature("occlusion_edges", "1", "share of the depth edges of more than 1 m and 5 % that image and map share", 1,
+            lambda e: e.refined.ray_evidence.occlusion_edges, ideal=True),
     Feature("upper_occlusion_edges", "1", "the same for edges of objects above vehicles and people", 1,
-            lambda e: e.refined.ray_evidence.upper_occlusion_edges),
+            lambda e: e.refined.ray_evidence.upper_occlusion_edges, ideal=True),
     Feature("inlier_advantage", "1", "share of inliers minus the median of the rivals", 1,
             lambda e: e.inlier_advantage, rivalry=True, ideal=True),
     Feature("unmapped", "1", "share of the points where the map shows nothing", -1, lambda e: e.best.scores["unmapped"],

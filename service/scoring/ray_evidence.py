@@ -26,11 +26,13 @@ EDGE_M, EDGE_SHARE = 1.0, 0.05
 class RayEvidence:
     """Numbers of the final pose that only the confidence uses; means over the frames.
 
+    Few pixels or edges make a weak share: ``HALF_PIXELS`` of them count half (``static_inliers`` then tends to 0.5, the others to 0).
+
     Attributes:
-        static_inliers: share of the pixels above the ground that lie on the map's surfaces, without what a moved vehicle explains; 0.5
-            without such pixels.
+        static_inliers: share of the pixels above the ground that lie on the map's surfaces, without what a moved vehicle explains.
         upper_through: share of the pixels on surfaces of the map above ``MOVABLE_M`` that lie behind these surfaces.
-        occlusion_edges: share of the depth edges of image and map that the other one has too, without what a moved vehicle explains.
+        occlusion_edges: share of the depth edges of image and map that the other one has too, without what a moved vehicle explains. The
+            other edge must be left over too: a pair of pixels beside a hole or a moved vehicle has no partner there.
         upper_occlusion_edges: the same for edges whose nearer side is higher than ``MOVABLE_M``.
     """
 
@@ -64,7 +66,7 @@ def ray_evidence(raycaster: SurfelRaycaster, measured: tuple[MeasuredFrame, ...]
 
     Args:
         raycaster: ray casting on the map.
-        measured: frames of the query that have points, at least one, the reference first.
+        measured: frames of the query that have points, at least one.
         pose: registered pose of the reference's level frame.
     """
     found = [astuple(ray_evidence_of(_ray_image(raycaster, each, each.pose(pose)))) for each in measured]

@@ -45,10 +45,17 @@ def test_features_beyond_the_range_are_named_the_farthest_first(calibration_with
 
 
 @pytest.mark.parametrize(
-    ("name", "below", "above"), [("place_m", False, True), ("static_inliers", True, False), ("points", True, True)]
+    ("name", "below", "above"),
+    [
+        ("place_m", False, True),
+        ("static_inliers", True, False),
+        ("occlusion_edges", True, False),
+        ("upper_occlusion_edges", True, False),
+        ("points", True, True),
+    ],
 )
 def test_a_feature_with_an_ideal_has_no_end_there(calibration_with, name, below, above):
-    """No place is too near, and no share of inliers is too large. A number of points has no ideal."""
+    """No place is too near, and no share of inliers or of shared edges is too large. A number of points has no ideal."""
     calibration = calibration_with(name)
     assert bool(extrapolated(calibration, evidence_of(**{name: -6.0}))) is below
     assert bool(extrapolated(calibration, evidence_of(**{name: 6.0}))) is above
