@@ -447,6 +447,21 @@ def test_the_best_supported_candidate_is_adjusted_and_its_covariance_is_that_of_
     np.testing.assert_array_equal(found.covariance, expected + relative_pose_covariance(3))
 
 
+def test_the_evidence_along_the_rays_is_that_of_the_final_pose(bundle, cloud, depth, here, seen_in, monkeypatch):
+    kept, asked = refining.ray_evidence, []
+
+    def call(*given):
+        asked.append(given)
+        return kept(*given)
+
+    monkeypatch.setattr(refining, "ray_evidence", call)
+    found = always_refined(bundle, cloud, (seen_in(depth, here),), None, RefineSettings())
+    ((_, _, pose),) = asked
+    assert pose is found.best.registered
+    assert found.ray_evidence == kept(*asked[0])
+    assert found.ray_evidence.static_inliers > 0.5
+
+
 def test_with_too_few_intersections_pose_and_covariance_are_those_of_the_points(
     bundle, cloud, depth, here, seen_in, asked
 ):

@@ -8,6 +8,7 @@ from hypothesis import strategies as st
 from service.geometry.camera import PinholeCamera
 from service.registration.points import PointSettings
 from service.registration.rays import RaySettings
+from service.registration.surfel_map import SurfelMap
 from service.registration.visibility import SurfelRaycaster
 from service.scoring.measured import measure
 from service.scoring.ray_evidence import RayImage, ray_evidence, ray_evidence_of
@@ -130,8 +131,17 @@ def test_the_map_is_seen_from_the_pose(raycaster, measured, candidate):
     )
     assert right.static_inliers > 0.95
     assert right.upper_through < 0.02
+    assert right.occlusion_edges > 0.5
     for wrong in (beside, turned):
         assert wrong.static_inliers < right.static_inliers - 0.2
+        assert wrong.occlusion_edges < right.occlusion_edges - 0.2
+
+
+def test_the_surfels_have_an_origin_of_their_own(street, raycaster, measured, candidate):
+    away = SurfelRaycaster(SurfelMap.prepare(np.array([100.0, -50.0, 3.0]), street.surfels()), RaySettings())
+    expected = ray_evidence(raycaster, measured, candidate(xyz=(0.0, 0.0, 1.5)).registered)
+    found = ray_evidence(away, measured, candidate(xyz=(100.0, -50.0, 4.5)).registered)
+    assert astuple(found) == pytest.approx(astuple(expected), abs=1e-3)
 
 
 def test_the_depth_is_corrected_by_scale_and_offset(raycaster, measured, candidate):
@@ -145,6 +155,36 @@ def test_the_depth_is_corrected_by_scale_and_offset(raycaster, measured, candida
     found = ray_evidence(raycaster, (changed,), replace(pose, scale=1.25, offset=0.5))
     assert astuple(found) == pytest.approx(astuple(expected), abs=0.02)
     assert ray_evidence(raycaster, (changed,), pose).static_inliers < expected.static_inliers - 0.1
+
+
+@pytest.mark.parametrize("offset", [-1e6, -0.5, 1e6])
+def test_no_offset_makes_a_number_that_is_not_finite(raycaster, measured, candidate, offset):
+    found = astuple(ray_evidence(raycaster, measured, replace(candidate().registered, offset=offset)))
+    assert np.isfinite(found).all()
+    assert all(0 <= share < 1 for share in found)
+
+
+def test_depth_without_a_baseline_has_no_offset(raycaster, measured, candidate):
+    pose = candidate(xyz=(0.0, 0.0, 1.5)).registered
+    (one,) = measured
+    plain = replace(one, picture=replace(one.picture, focal_baseline_px_m=None))
+    assert ray_evidence(raycaster, (plain,), replace(pose, offset=3.0)) == ray_evidence(raycaster, measured, pose)
+
+
+def test_another_frame_is_compared_at_its_own_pose(street_map, raycaster, frame_with, matches_at, candidate):
+    """It looks at the street from 3 m ahead of the reference."""
+    frame, pose = frame_with(matches_at([(0, 0, 2)], [0], [0.9])), candidate(xyz=(0.0, 0.0, 1.5)).registered
+    camera = PinholeCamera(120, 90, 60.0, 60.0, 59.5, 44.5)
+    ahead = np.eye(4)
+    ahead[2, 3] = 3.0
+    frames = []
+    for T_reference_camera in (np.eye(4), ahead):
+        T = frame.pose_of_camera(pose.T_map_level) @ T_reference_camera
+        seen = replace(frame.query, depth_m=raycaster.depth(T, camera).astype(np.float32), camera=camera)
+        frames.append(replace(frame, query=seen, T_reference_camera=T_reference_camera))
+    _, other = measure(tuple(frames), PointSettings(), focal_baseline_px_m=80.0, is_rig=True)
+    assert ray_evidence(raycaster, (other,), pose).static_inliers > 0.95
+    assert ray_evidence(raycaster, (replace(other, is_reference=True),), pose).static_inliers < 0.9
 
 
 def test_frames_are_averaged(raycaster, measured, candidate):
