@@ -43,6 +43,10 @@ WHY_FELL: dict[str, str] = {
         "A difference of less than a millimetre. We did not examine it. The errors of the survey's poses, 0.03 m for each axis, are most "
         "of this median (decision 0094)"
     ),
+    "full.unseen.precise.median_heading_error_deg": (
+        "A difference of less than a thousandth of a degree. We did not examine it. A build aligns the survey with rounded normals since "
+        "format 6 of the maps (decision 0200), so all poses of the map move a little"
+    ),
     "full.condition.low_sun.recall_at_1_5m": (
         "One of 500 queries. Within the first ten places: {then full.condition.low_sun.recall_at_10_5m} -> "
         "{now full.condition.low_sun.recall_at_10_5m}"

@@ -117,7 +117,7 @@ WHY_MISSED: dict[str, Reason] = {
         "Confidence causes most losses. 58 of 3,000 queries have a forced error above 1 m. 125 answers are refused, and 80 of these are "
         "right: a LOCALIZED answer needs a confidence of 0.9, and 52 of the 80 have 0.65 to 0.9. 13 accepted answers are wrong (0.5 %), by "
         "1 to 2 m. An earlier default reached 0.970, but accepted 29 wrong answers and 8 % of the images of another city. Decision 0165 "
-        "raised the value from 0.936 to 0.947, the encoder of decision 0174 to 0.952, and evidence along the rays (decision 0201) to 0.954. "
+        "raised the value from 0.936 to 0.947, the encoder of decision 0174 to 0.952, evidence along the rays (0201) to 0.954. "
         "Tried: other models, 60 numbers of the image (decision 0165), rivals without similarity (decision 0181)",
     ),
     "doubt.expected_calibration_error": Reason(
