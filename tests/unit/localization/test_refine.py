@@ -25,6 +25,7 @@ from service.retrieval.starts import StartSettings
 from service.scoring import similarity as similar
 from service.scoring.measured import measure
 from service.scoring.photometry import BrightnessScorer
+from service.scoring.ray_evidence import ray_evidence
 from service.scoring.scorer import Scores
 from service.scoring.similarity import similarity_of
 from service.scoring.structure import StructureWeights
@@ -448,7 +449,7 @@ def test_the_best_supported_candidate_is_adjusted_and_its_covariance_is_that_of_
 
 
 def test_the_evidence_along_the_rays_is_that_of_the_final_pose(bundle, cloud, depth, here, seen_in, monkeypatch):
-    kept, asked = refining.ray_evidence, []
+    kept, asked = ray_evidence, []
 
     def call(*given):
         asked.append(given)
