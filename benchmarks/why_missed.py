@@ -62,7 +62,8 @@ _HEIGHTS = (
     "of 200 are accepted and wrong, at 0.8 m one, elsewhere none. The default needs a confidence of 0.9 since decision 0149. Tried: "
     "training on cameras of 0.3 to 3.2 m (decision 0154; forced at 0.2 m 0.815 -> 0.93), depth structure and confirmation (decisions "
     "0159 and 0165; accepted at 0.2 m 0.775 -> 0.88), a larger encoder (decision 0174; accepted at 0.8 m 0.915 -> 0.93, at 3.5 m 0.93 -> "
-    "0.90). A given height gains nothing, because the estimate errs by 0.02 to 0.04 m. Next: low and high cameras in the calibration"
+    "0.90). A given height gains nothing, because the estimate errs by 0.02 to 0.04 m. Next: "
+    "measure again. The calibration has cameras at 0.25, 0.4 and 3.4 m since decision 0201, and these rows are older"
 )
 _OVER_BARE = (
     "Medians of runs differ by up to 20 %: full REST 0.95 to 1.13, retrieval REST 1.14 to 1.27, retrieval gRPC 1.14 to 1.39. With one "

@@ -171,7 +171,7 @@ def test_depth_without_a_baseline_has_no_offset(raycaster, measured, candidate):
     assert ray_evidence(raycaster, (plain,), replace(pose, offset=3.0)) == ray_evidence(raycaster, measured, pose)
 
 
-def test_another_frame_is_compared_at_its_own_pose(street_map, raycaster, frame_with, matches_at, candidate):
+def test_another_frame_is_compared_at_its_own_pose(raycaster, frame_with, matches_at, candidate):
     """It looks at the street from 3 m ahead of the reference."""
     frame, pose = frame_with(matches_at([(0, 0, 2)], [0], [0.9])), candidate(xyz=(0.0, 0.0, 1.5)).registered
     camera = PinholeCamera(120, 90, 60.0, 60.0, 59.5, 44.5)
