@@ -187,7 +187,13 @@ def test_of_many_places_only_the_best_supported_are_compared_and_the_others_get_
     assert found == [(0.0, 15.0), (10.0, 13.0), (20.0, 11.0), (30.0, 9.0), (40.0, 8.0), (50.0, 7.0)]
 
 
-@pytest.mark.parametrize("name", ["brightness_gap", "rays_gap"])
-def test_compared_candidates_must_have_a_structure(name):
+@pytest.mark.parametrize(
+    ("name", "weights"),
+    [
+        ("brightness_gap", lambda: SupportWeights(brightness_gap=9.0)),
+        ("rays_gap", lambda: SupportWeights(rays_gap=9.0)),
+    ],
+)
+def test_compared_candidates_must_have_a_structure(name, weights):
     with pytest.raises(ValueError, match=rf"{name}: 9 must be at most structure_gap \(8\)"):
-        SupportWeights(**{name: 9.0})
+        weights()
