@@ -43,6 +43,7 @@ CODE: dict[str, Callable[[], float]] = {
     "safe_confidence": lambda: SAFE_CONFIDENCE,
     "wrong_rate": lambda: WRONG_RATE,
     "structure_gap": lambda: SupportWeights().structure_gap,
+    "rays_most": lambda: SupportWeights().rays_most,
     "least_false_accept_rate": lambda: stock_calibration().least_false_accept_rate,
     "localized_from_confidence": lambda: stock_calibration().threshold(FALSE_ACCEPT_RATE),
 }

@@ -239,6 +239,7 @@ TABLE: tuple[Feature, ...] = (
     Feature("log_noise", "log 1/m", "standard deviation of the inverse depth of one pixel", -1,
             lambda e: float(np.log(np.median([frame.noise for frame in e.frames])))),
     Feature("points", "3000", "points of a frame", 1, lambda e: e.refined.points / 3000.0 / len(e.frames)),
+    Feature("frames", "log 1", "number of frames of the query", 1, lambda e: float(np.log(len(e.frames))), ideal=True),
     Feature("measured", "1", "share of the view grid with a measurement", 1, lambda e: e.frames[0].views.measured_share),
     Feature("place_m", "m", "distance of the places around the pose, at most 10 m", -1,
             lambda e: min(e.best.scores["place_m"], _MOST_PLACE_M), ideal=True),

@@ -38,7 +38,8 @@ class Reason:
     remedy: str
 
 
-#: Possible causes, the likeliest first: name, confidence features that indicate it, remedy. ``similarity`` and ``log_share`` indicate none.
+#: Possible causes, the likeliest first: name, confidence features that indicate it, remedy. ``similarity``, ``frames`` and ``log_share``
+#: indicate none.
 GROUPS: tuple[tuple[str, tuple[str, ...], str], ...] = (
     ("intrinsics", ("facings",), "compare fx, fy, cx, cy and the image size with the calibration of the camera"),
     ("depth unit", ("scale",), "check depth.scale_m and depth.kind (metres for each stored unit; z or range)"),

@@ -22,7 +22,7 @@ from service.registration.covariance import (
 from service.registration.kernel import QueryPoints
 from service.registration.local_search import LocalSearchSettings, search_locally
 from service.registration.points import FOCAL_BASELINE_PX_M, PointSettings
-from service.registration.rays import OFFSET_PX, RaySettings, adjust
+from service.registration.rays import OFFSET_PX, RaySettings
 from service.registration.register import Registered, RegistrationSettings, Start, register
 from service.registration.restarts import RestartSettings, difference, spread_of_restarts
 from service.registration.surfel_tiles import Cloud
@@ -34,7 +34,7 @@ from service.scoring.candidates import Candidate, Refined
 from service.scoring.confirmation import Confirmation, confirm
 from service.scoring.measured import MeasuredFrame, measure, merged_points
 from service.scoring.photometry import BrightnessScorer, PhotometrySettings
-from service.scoring.ray_evidence import RayEvidence, ray_evidence
+from service.scoring.ray_evidence import RayEvidence, RayScorer
 from service.scoring.similarity import similarity_of
 from service.scoring.structure import StructureScorer
 from service.scoring.support import LocalScoreWeights, PoseScorer, SupportWeights, scorers_of
@@ -178,6 +178,7 @@ def _scorer_of(
         scorers_of(bundle, cloud, measured, prior, settings.support),
         StructureScorer(cloud, measured, settings.support.structure),
         BrightnessScorer(raycasters, measured, settings.photometry),
+        RayScorer(raycasters, measured, settings.rays, settings.support.rays),
         settings.support,
         settings.near,
     )
@@ -218,18 +219,15 @@ def _adjusted(
 ) -> _Adjusted:
     """Adjust the pose of a candidate along the rays. If too few rays intersect the map, it stays the pose of the points."""
     found, pictures = candidate.registered, [each.picture for each in scorer.measured]
-    raycaster = raycasters.at(found.camera_m)
-    adjusted = adjust(raycaster, pictures, found, settings.rays)
-    if adjusted is None:
-        pose = found
-        scatter = score_outer_product(cloud.at(pose.camera_m), points, pose, settings.registration)
-    else:
-        pose, scatter = adjusted
+    along = scorer.rays.at(found)
+    pose, scatter = along.pose, along.scatter
     T_map_camera = scorer.measured[0].frame.pose_of_camera(pose.T_map_level)
     heading, confirmation = heading_of_camera(T_map_camera), confirm(cloud, scorer.structure, pose)
-    if adjusted is None:
+    if scatter is None:
+        scatter = score_outer_product(cloud.at(pose.camera_m), points, pose, settings.registration)
         covariance = covariance_of(pose.information, scatter, noise, heading, OF_POINTS)
     else:
+        raycaster = raycasters.at(found.camera_m)
         stability = Stability(
             restarts=spread_of_restarts(raycaster, pictures, pose, heading, settings.rays, settings.restarts),
             shift=difference(pose.T_map_level, found.T_map_level),
@@ -237,8 +235,7 @@ def _adjusted(
             along_residual=confirmation.along_residual,
         )
         covariance = covariance_of(pose.information, scatter, noise, heading, OF_RAYS, stability)
-    evidence = ray_evidence(raycaster, scorer.structure.measured, pose)
-    return _Adjusted(pose, T_map_camera, scatter, confirmation, evidence, covariance)
+    return _Adjusted(pose, T_map_camera, scatter, confirmation, along.evidence, covariance)
 
 
 def _starts(

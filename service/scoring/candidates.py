@@ -15,6 +15,8 @@ from service.scoring.ray_evidence import RayEvidence
 
 #: Two candidates are rivals beyond this distance or this angle. Adjacent positions on one street are not rivals.
 RIVAL_M, RIVAL_RAD = 3.0, float(np.deg2rad(30.0))
+#: Two candidates are at the same place up to this distance and this angle. The ray adjustment moves both to the same pose.
+SAME_M, SAME_RAD = 0.7, 0.1
 _LEAST_MAPPED = 0.05
 
 
@@ -111,10 +113,25 @@ def is_rival(one: Candidate, other: Candidate) -> bool:
         one: candidate.
         other: another candidate.
     """
+    return _is_apart(one, other, RIVAL_M, RIVAL_RAD)
+
+
+def is_same_place(one: Candidate, other: Candidate) -> bool:
+    """Return whether two candidates are so near that the ray adjustment moves them to the same pose.
+
+    Args:
+        one: candidate.
+        other: another candidate.
+    """
+    return not _is_apart(one, other, SAME_M, SAME_RAD)
+
+
+def _is_apart(one: Candidate, other: Candidate, most_m: float, most_rad: float) -> bool:
+    """Return whether two candidates differ by more than a distance or an angle."""
     apart = math.dist(one.T_map_camera[:3, 3], other.T_map_camera[:3, 3])
     # The trace of the relative rotation is 1 + 2 cos(angle).
     trace = (one.T_map_camera[:3, :3] * other.T_map_camera[:3, :3]).sum()
-    return bool(apart > RIVAL_M or trace < 1 + 2 * np.cos(RIVAL_RAD))
+    return bool(apart > most_m or trace < 1 + 2 * np.cos(most_rad))
 
 
 def distinct_candidates(candidates: tuple[Candidate, ...]) -> tuple[Candidate, ...]:

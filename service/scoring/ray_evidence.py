@@ -13,9 +13,11 @@ from jaxtyping import Bool, Float32, Float64
 from numpy.typing import NDArray
 
 from service.registration.points import GROUND_M, MOVABLE_M
+from service.registration.rays import RaySettings, adjust
 from service.registration.register import Registered
-from service.registration.visibility import SurfelRaycaster
+from service.registration.visibility import Raycasters, SurfelRaycaster
 from service.scoring.measured import MeasuredFrame
+from service.scoring.scorer import Scores
 from service.scoring.structure import HALF_PIXELS, INLIER_SIGMAS, LEAST_STRETCH, MOST_SIGMAS, SURFACE_M, near_edges
 
 #: A depth edge between two horizontal neighbours: the farther one is farther by more than EDGE_M plus EDGE_SHARE of the nearer depth, m.
@@ -31,8 +33,7 @@ class RayEvidence:
     Attributes:
         static_inliers: share of the pixels above the ground that lie on the map's surfaces, without what a moved vehicle explains.
         upper_through: share of the pixels on surfaces of the map above ``MOVABLE_M`` that lie behind these surfaces.
-        occlusion_edges: share of the depth edges of image and map that the other one has too, without what a moved vehicle explains. The
-            other edge must be left over too: a pair of pixels beside a hole or a moved vehicle has no partner there.
+        occlusion_edges: share of the depth edges of image and map that the other one has too, without what a moved vehicle explains.
         upper_occlusion_edges: the same for edges whose nearer side is higher than ``MOVABLE_M``.
     """
 
@@ -40,6 +41,21 @@ class RayEvidence:
     upper_through: float
     occlusion_edges: float
     upper_occlusion_edges: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RayWeights:
+    """Weights of two numbers of ``RayEvidence`` in the support, nats.
+
+    Fitted by a conditional logit over the candidates of 600 queries of five rigs in as many training cities (decision 0202).
+
+    Attributes:
+        static_inliers: weight of the inliers without what a moved vehicle explains.
+        occlusion_edges: weight of the shared depth edges of more than a metre.
+    """
+
+    static_inliers: float = 12.0
+    occlusion_edges: float = 13.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -85,7 +101,8 @@ def ray_evidence_of(image: RayImage) -> RayEvidence:
     sigmas = np.where(both, (_inverse(image.z_m) - _inverse(image.mapped_m)) / image.sigma, 0.0)
     through, front = sigmas < -MOST_SIGMAS, sigmas > MOST_SIGMAS
     raised, upper, mapped_upper = height_m > GROUND_M, height_m > MOVABLE_M, mapped_height_m >= MOVABLE_M
-    moved = through & ~mapped_upper | front & raised & ~upper
+    left = through & (mapped_height_m > GROUND_M) & ~mapped_upper
+    moved = left | front & raised & ~upper
     static = both & raised & ~moved
     inliers = float((static & (np.abs(sigmas) < INLIER_SIGMAS)).sum())
     kept = ~(moved[:, 1:] | moved[:, :-1])
@@ -138,9 +155,12 @@ def _shared(
     other: Bool[NDArray[np.bool_], "2 H pairs"],
     compared: Bool[NDArray[np.bool_], "H pairs"],
 ) -> float:
-    """Return the share of the edges of two images that the other image has too, within a pixel and in the same direction."""
+    """Return the share of the compared edges of two images that the other image has too, within a pixel and in the same direction.
+
+    The edge in the other image may lie beside a hole or a moved vehicle, where nothing is compared.
+    """
     edges, others = one & compared, other & compared
-    shared = (edges & near_edges(others)).sum() + (others & near_edges(edges)).sum()
+    shared = (edges & near_edges(other)).sum() + (others & near_edges(one)).sum()
     return float(shared) / (float(edges.sum() + others.sum()) + HALF_PIXELS)
 
 
@@ -167,3 +187,74 @@ def _inverse(
 ) -> Float64[NDArray[np.float64], "H W"]:
     """Return the inverse of each value, 0 for 0."""
     return np.divide(1.0, values, out=np.zeros(values.shape), where=values > 0)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RayPose:
+    """A registered pose after its adjustment along the rays.
+
+    Attributes:
+        pose: the adjusted pose, or the registered one if too few rays meet the map.
+        scatter: scatter of the patches' gradients there, as ``adjust`` returns it; None if the pose was not adjusted.
+        evidence: comparison with the map along the rays of this pose.
+    """
+
+    pose: Registered
+    scatter: Float64[NDArray[np.float64], "8 8"] | None
+    evidence: RayEvidence
+
+
+class RayScorer:
+    """Scorer by the comparison along the rays, after an adjustment of each pose. Its score is in nats.
+
+    It keeps the adjusted poses, because the best candidate needs its own again.
+
+    Args:
+        raycasters: ray casting on the map, for any position.
+        measured: frames of the query, the reference first.
+        settings: settings of the ray adjustment.
+        weights: weights of the numbers.
+    """
+
+    name = "rays"
+
+    def __init__(
+        self, raycasters: Raycasters, measured: tuple[MeasuredFrame, ...], settings: RaySettings, weights: RayWeights
+    ) -> None:
+        self._raycasters, self._settings, self._weights = raycasters, settings, weights
+        self._pictures = [each.picture for each in measured]
+        self._measured = tuple(each for each in measured if len(each.points))
+        self._known: list[tuple[Registered, RayPose]] = []
+
+    def at(self, pose: Registered) -> RayPose:
+        """Adjust a pose along the rays, and compare it with the map there. A pose that was adjusted before is not adjusted again.
+
+        Args:
+            pose: registered pose of the reference's level frame.
+        """
+        for known, found in self._known:
+            if known is pose:
+                return found
+        raycaster = self._raycasters.at(pose.camera_m)
+        adjusted, scatter = adjust(raycaster, self._pictures, pose, self._settings) or (pose, None)
+        found = RayPose(adjusted, scatter, ray_evidence(raycaster, self._measured, adjusted))
+        self._known.append((pose, found))
+        return found
+
+    def score(self, poses: tuple[Registered, ...]) -> Scores:
+        """Return the score of each pose: inliers and shared edges with their weights. It has no details.
+
+        Args:
+            poses: registered poses of the reference's level frame.
+        """
+        found = [self.at(pose).evidence for pose in poses]
+        weights = self._weights
+        return Scores(
+            np.array(
+                [
+                    weights.static_inliers * each.static_inliers + weights.occlusion_edges * each.occlusion_edges
+                    for each in found
+                ],
+                np.float64,
+            )
+        )

@@ -10,11 +10,12 @@ from service.registration.local_search import LocalPose
 from service.registration.register import Registered
 from service.registration.surfel_tiles import Cloud
 from service.retrieval.prior import Prior
-from service.scoring.candidates import Candidate
+from service.scoring.candidates import Candidate, is_same_place
 from service.scoring.inliers import InlierScorer
 from service.scoring.measured import MeasuredFrame
 from service.scoring.photometry import BrightnessScorer
 from service.scoring.prior import PriorScorer
+from service.scoring.ray_evidence import RayScorer, RayWeights
 from service.scoring.rendered_depth import RenderedDepthScorer
 from service.scoring.scorer import Scorer
 from service.scoring.similarity import SimilarityScorer
@@ -37,6 +38,9 @@ class SupportWeights:
         brightness_gap: largest support gap to the best candidate at which brightness is computed, nats. Rendering takes time.
         structure: weights of the depth structure.
         structure_gap: the same gap for the depth structure.
+        rays: weights of the comparison along the rays.
+        rays_gap: the same gap for this comparison. It comes last and takes most time.
+        rays_most: largest number of places that are compared along the rays.
     """
 
     inliers: float = 20.0
@@ -47,17 +51,21 @@ class SupportWeights:
     brightness_gap: float = 4.0
     structure: StructureWeights = field(default_factory=StructureWeights)
     structure_gap: float = 8.0
+    rays: RayWeights = field(default_factory=RayWeights)
+    rays_gap: float = 8.0
+    rays_most: int = 4
 
     def __post_init__(self) -> None:
-        """Check that every candidate with a brightness has a structure, so that the best one always has it.
+        """Check that every candidate with a brightness or rays has a structure, so that the best one always has it.
 
         Raises:
-            ValueError: ``brightness_gap`` exceeds ``structure_gap``.
+            ValueError: ``brightness_gap`` or ``rays_gap`` exceeds ``structure_gap``.
         """
-        if self.brightness_gap > self.structure_gap:
-            raise ValueError(
-                f"brightness_gap: {self.brightness_gap:g} must be at most structure_gap ({self.structure_gap:g})"
-            )
+        for name in ("brightness_gap", "rays_gap"):
+            if getattr(self, name) > self.structure_gap:
+                raise ValueError(
+                    f"{name}: {getattr(self, name):g} must be at most structure_gap ({self.structure_gap:g})"
+                )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -91,7 +99,7 @@ def scorers_of(
 ) -> tuple[Weighted, ...]:
     """Return the scorers that rate every candidate of a query, each with its weight. A new scorer is one more line.
 
-    Depth structure and brightness are not among them: ``PoseScorer.with_details`` adds them for the leading candidates only.
+    Depth structure, brightness and rays are not among them: ``PoseScorer.with_details`` adds them for the leading candidates only.
 
     Args:
         bundle: the map.
@@ -117,6 +125,7 @@ class PoseScorer:
         scorers: scorers that rate every pose, with their weights.
         structure: scorer that rates the leading poses.
         brightness: another scorer that rates the leading poses.
+        rays: the last scorer that rates the leading poses.
         weights: weights of the support.
         near: weights for the choice among poses about a metre apart.
     """
@@ -125,11 +134,12 @@ class PoseScorer:
     scorers: tuple[Weighted, ...]
     structure: StructureScorer
     brightness: BrightnessScorer
+    rays: RayScorer
     weights: SupportWeights
     near: LocalScoreWeights
 
     def candidates(self, found: tuple[Registered, ...]) -> list[Candidate]:
-        """Score poses without depth structure and brightness; return them with the best supported first.
+        """Score poses without depth structure, brightness and rays; return them with the best supported first.
 
         Args:
             found: registered poses of the reference's level frame.
@@ -146,18 +156,42 @@ class PoseScorer:
         return sorted(candidates, key=lambda candidate: -candidate.support)
 
     def with_details(self, candidates: list[Candidate]) -> list[Candidate]:
-        """Add depth structure and brightness to the support; return all candidates, the best supported first.
+        """Add depth structure, brightness and rays to the support; return all candidates, the best supported first.
 
-        Both render the map, which takes time. So only candidates whose support is near that of the best are compared. The best one
-        always has its structure, for the confidence. Brightness is left out if the map has none, or if only one candidate leads.
+        All three render the map, which takes time. So only candidates whose support is near that of the best are compared. The best one
+        always has its structure, for the confidence. Brightness is left out if the map has none. Brightness and rays are left out if only
+        one candidate leads.
 
         Args:
             candidates: candidates as ``candidates`` returns them, the best supported first.
         """
-        candidates = _rescored(candidates, self.structure, 1.0, self.weights.structure_gap)
-        if not self.brightness.is_known or len(_leading(candidates, self.weights.brightness_gap)) == 1:
+        weights = self.weights
+        candidates = _rescored(candidates, self.structure, 1.0, weights.structure_gap)
+        if self.brightness.is_known and len(_leading(candidates, weights.brightness_gap)) > 1:
+            candidates = _rescored(candidates, self.brightness, weights.brightness, weights.brightness_gap)
+        return self._with_rays(candidates)
+
+    def _with_rays(self, candidates: list[Candidate]) -> list[Candidate]:
+        """Add the comparison along the rays to the support, if the leading candidates are at several places.
+
+        Only the best supported candidate of each place is compared. The others there get its score, because the adjustment moves them to
+        the same pose.
+        """
+        leading = _leading(candidates, self.weights.rays_gap)
+        places = list[Candidate]()
+        for each in leading:
+            if not any(is_same_place(each, other) for other in places):
+                places.append(each)
+        if len(places) == 1:
             return candidates
-        return _rescored(candidates, self.brightness, self.weights.brightness, self.weights.brightness_gap)
+        compared = places[: self.weights.rays_most]
+        values = self.rays.score(tuple(each.registered for each in compared)).values.tolist()
+        rescored = []
+        for each in candidates:
+            known = (value for other, value in zip(compared, values, strict=True) if is_same_place(each, other))
+            value = next(known, min(values)) if each in leading else min(values)
+            rescored.append(replace(each, support=each.support + value, scores={**each.scores, self.rays.name: value}))
+        return sorted(rescored, key=lambda candidate: -candidate.support)
 
     def select_local_optimum(self, best: Candidate, near: list[LocalPose]) -> Candidate:
         """Choose the best of several poses near a candidate.

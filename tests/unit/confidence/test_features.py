@@ -325,6 +325,11 @@ def test_the_noise_is_the_median_of_the_frames_and_points_are_counted_a_frame(we
     assert weighed(points=4500)["points"] == pytest.approx(1.5)
 
 
+@pytest.mark.parametrize(("count", "expected"), [(1, 0.0), (5, np.log(5.0))])
+def test_more_frames_speak_for_an_answer(weighed, frame, count, expected):
+    assert weighed(frames=(frame,) * count)["frames"] == pytest.approx(expected)
+
+
 def test_distances_are_from_the_best_candidate(candidate, weighed):
     there = candidate(10.0, xyz=(100, 0, 1.5))
     places = [neighbour(0, 0.9), neighbour(100, 0.7)]

@@ -22,10 +22,11 @@ from service.registration.restarts import difference, spread_of_restarts
 from service.registration.visibility import SurfelRaycaster
 from service.retrieval.prior import Prior
 from service.retrieval.starts import StartSettings
+from service.scoring import ray_evidence as along_rays
 from service.scoring import similarity as similar
 from service.scoring.measured import measure
 from service.scoring.photometry import BrightnessScorer
-from service.scoring.ray_evidence import ray_evidence
+from service.scoring.ray_evidence import RayWeights, ray_evidence
 from service.scoring.scorer import Scores
 from service.scoring.similarity import similarity_of
 from service.scoring.structure import StructureWeights
@@ -114,11 +115,14 @@ def always_refined(bundle, cloud, frames, prior, settings):
     return found
 
 
-NO_STRUCTURE = StructureWeights(shared_edges=0.0, upper_inliers=0.0, contrast=0.0)
+NO_DETAILS = {
+    "structure": StructureWeights(shared_edges=0.0, upper_inliers=0.0, contrast=0.0),
+    "rays": RayWeights(static_inliers=0.0, occlusion_edges=0.0),
+}
 
 
 def refined(bundle, cloud, *frames, prior=None, **weights):
-    support = SupportWeights(**{"structure": NO_STRUCTURE, **weights}) if weights else SupportWeights()
+    support = SupportWeights(**{**NO_DETAILS, **weights}) if weights else SupportWeights()
     return refine(
         bundle, cloud, frames, prior, RefineSettings(starts=EVERY_VIEW, support=support, registration=BY_INLIERS)
     )
@@ -398,16 +402,17 @@ def asked(monkeypatch):
     """Record the arguments of each function of the last stage, in order."""
     calls = []
 
-    def noted(name):
-        kept = getattr(refining, name)
+    def noted(name, module=refining):
+        kept = getattr(module, name)
 
         def call(*given, **named):
             calls.append((name, given))
             return kept(*given, **named)
 
-        monkeypatch.setattr(refining, name, call)
+        monkeypatch.setattr(module, name, call)
 
-    for name in ("adjust", "spread_of_restarts", "score_outer_product", "covariance_of"):
+    noted("adjust", along_rays)
+    for name in ("spread_of_restarts", "score_outer_product", "covariance_of"):
         noted(name)
     return calls
 
@@ -415,10 +420,13 @@ def asked(monkeypatch):
 def test_the_best_supported_candidate_is_adjusted_and_its_covariance_is_that_of_its_rays(
     bundle, cloud, depth, both, seen_in, asked
 ):
-    """It is not the candidate with most inliers, because the views of the other street are more similar."""
+    """It is not the candidate with most inliers, because the views of the other street are more similar.
+
+    Only this candidate is compared along the rays, and its adjusted pose is used again.
+    """
     first = seen_in(depth, both)
     frames = [replace(first, noise=noise) for noise in (3e-4, 1e-4, 2e-4)]
-    found = refined(bundle, cloud, *frames, inliers=1.0, similarity=1.0, likelihood=0.0)
+    found = refined(bundle, cloud, *frames, inliers=1.0, similarity=1.0, likelihood=0.0, rays_most=1)
     best = found.best.registered
     assert best.inliers < max(each.registered.inliers for each in found.candidates)
     assert [name for name, _ in asked] == ["adjust", "spread_of_restarts", "covariance_of"]
@@ -455,7 +463,7 @@ def test_the_evidence_along_the_rays_is_that_of_the_final_pose(bundle, cloud, de
         asked.append(given)
         return kept(*given)
 
-    monkeypatch.setattr(refining, "ray_evidence", call)
+    monkeypatch.setattr(along_rays, "ray_evidence", call)
     found = always_refined(bundle, cloud, (seen_in(depth, here),), None, RefineSettings())
     ((_, _, pose),) = asked
     assert pose is found.best.registered

@@ -7,11 +7,12 @@ from hypothesis import strategies as st
 
 from service.geometry.camera import PinholeCamera
 from service.registration.points import PointSettings
-from service.registration.rays import RaySettings
+from service.registration.rays import RaySettings, adjust
 from service.registration.surfel_map import SurfelMap
-from service.registration.visibility import SurfelRaycaster
+from service.registration.visibility import Raycasters, SurfelRaycaster
+from service.scoring import ray_evidence as along_rays
 from service.scoring.measured import measure
-from service.scoring.ray_evidence import RayImage, ray_evidence, ray_evidence_of
+from service.scoring.ray_evidence import RayImage, RayScorer, RayWeights, ray_evidence, ray_evidence_of
 
 #: 60 columns and 40 rows, 1.5 m above the ground. A ray of row r gains (19.5 - r) / 20 m for each metre of depth.
 SHAPE = (40, 60)
@@ -91,6 +92,26 @@ def test_a_pole_has_an_edge_on_each_side():
     assert found.upper_occlusion_edges == pytest.approx(4 * high / (4 * high + 20))
     other = ray_evidence_of(image(pole, moved))
     assert (other.occlusion_edges, other.upper_occlusion_edges) == (0.0, 0.0)
+
+
+def test_an_edge_has_its_partner_although_a_hole_is_beside_it():
+    """The map shows the pole a column further right, where the image has a hole. So no edge of the map is compared.
+
+    The left edge of the image's pole is within a pixel of the map's. Rows 18 to 24 may be a vehicle that came, 0 to 17 are higher.
+    """
+    seen = scene(columns=(30,))
+    seen[:, 31] = 0.0
+    found = ray_evidence_of(image(seen, scene(columns=(31,))))
+    assert (found.occlusion_edges, found.upper_occlusion_edges) == pytest.approx((18 / 38, 18 / 38))
+
+
+def test_what_lies_below_the_ground_of_the_map_is_no_vehicle_that_left():
+    """From column 30 on, the rays to the ground (rows 23 to 39) go twice as far. These 17 edges count, and the map has none there."""
+    mapped = scene(columns=(10,))
+    seen = mapped.copy()
+    seen[23:, 30:] *= 2
+    found = ray_evidence_of(image(seen, mapped))
+    assert found.occlusion_edges == pytest.approx(4 * 25 / (4 * 25 + 17 + 20))
 
 
 def test_without_a_surface_nothing_is_said():
@@ -193,3 +214,43 @@ def test_frames_are_averaged(raycaster, measured, candidate):
     blind = replace(one, is_reference=False, picture=replace(one.picture, inverse=np.zeros_like(one.picture.inverse)))
     expected = 0.5 * (np.array(astuple(ray_evidence(raycaster, measured, pose))) + (0.5, 0.0, 0.0, 0.0))
     assert astuple(ray_evidence(raycaster, (one, blind), pose)) == pytest.approx(tuple(expected))
+
+
+def test_the_scorer_weighs_two_numbers_of_the_adjusted_poses(street_map, measured, candidate):
+    """The second pose is 0.3 m ahead. Its adjustment moves it to the first."""
+    scorer = RayScorer(Raycasters(street_map, RaySettings()), measured, RaySettings(), RayWeights())
+    right, ahead, beside = (
+        candidate(xyz=xyz).registered for xyz in ((0.0, 0.0, 1.5), (0.3, 0.0, 1.5), (0.0, 12.0, 1.5))
+    )
+    values = scorer.score((right, ahead, beside)).values
+    found = [scorer.at(pose).evidence for pose in (right, ahead, beside)]
+    assert values == pytest.approx([12 * each.static_inliers + 13 * each.occlusion_edges for each in found])
+    assert values[1] == pytest.approx(values[0], abs=0.5)
+    assert values[2] < values[0] - 3
+    np.testing.assert_allclose(scorer.at(ahead).pose.camera_m, scorer.at(right).pose.camera_m, atol=0.02)
+
+
+def test_a_pose_is_adjusted_once(street_map, measured, candidate, monkeypatch):
+    asked = []
+
+    def counted(raycaster, pictures, pose, settings):
+        asked.append(pose)
+        return adjust(raycaster, pictures, pose, settings)
+
+    monkeypatch.setattr(along_rays, "adjust", counted)
+    scorer = RayScorer(Raycasters(street_map, RaySettings()), measured, RaySettings(), RayWeights())
+    pose, like_it = candidate(xyz=(0.0, 0.0, 1.5)).registered, candidate(xyz=(0.0, 0.0, 1.5)).registered
+    scorer.score((pose,))
+    first = scorer.at(pose)
+    assert scorer.at(pose) is first
+    assert scorer.at(like_it) is not first
+    assert [each is pose for each in asked] == [True, False]
+
+
+def test_a_pose_with_too_few_rays_is_compared_as_it_is(street_map, measured, candidate):
+    settings = RaySettings(fewest=10**6)
+    pose = candidate(xyz=(0.0, 0.0, 1.5)).registered
+    found = RayScorer(Raycasters(street_map, settings), measured, settings, RayWeights()).at(pose)
+    assert found.pose is pose
+    assert found.scatter is None
+    assert found.evidence == ray_evidence(SurfelRaycaster(street_map, settings), measured, pose)

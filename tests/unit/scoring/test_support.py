@@ -12,6 +12,7 @@ from service.scoring.inliers import InlierScorer
 from service.scoring.measured import measure
 from service.scoring.photometry import BrightnessScorer, PhotometrySettings
 from service.scoring.prior import PriorScorer
+from service.scoring.ray_evidence import RayScorer, RayWeights
 from service.scoring.scorer import Scorer, Scores
 from service.scoring.structure import StructureScorer, StructureWeights
 from service.scoring.support import LocalScoreWeights, PoseScorer, SupportWeights, scorers_of
@@ -55,9 +56,16 @@ def structure(street_map, measured):
 
 
 @pytest.fixture
-def scorer_of(measured, structure, brightness):
+def rays(street_map, measured):
+    return RayScorer(Raycasters(street_map, RaySettings()), measured, RaySettings(), RayWeights())
+
+
+@pytest.fixture
+def scorer_of(measured, structure, brightness, rays):
     """Return the scorer of poses, for scorers and their weights."""
-    return lambda *scorers: PoseScorer(measured, scorers, structure, brightness, SupportWeights(), LocalScoreWeights())
+    return lambda *scorers: PoseScorer(
+        measured, scorers, structure, brightness, rays, SupportWeights(), LocalScoreWeights()
+    )
 
 
 @pytest.fixture
@@ -90,15 +98,17 @@ def test_the_prior_scores_the_position_and_heading_of_each_pose_however_it_leans
 
 @pytest.mark.parametrize(("prior", "names"), [(None, ()), (PRIOR, ("prior",))])
 def test_every_scorer_has_the_same_interface_and_a_name_of_its_own(
-    bundle_at, street_map, measured, structure, brightness, prior, names
+    bundle_at, street_map, measured, structure, brightness, rays, prior, names
 ):
     bundle = bundle_at([(0.0, 0.0, 1.8)], [0.0], [(1.0, 0.0)])
     weights = SupportWeights()
     listed = scorers_of(bundle, street_map, measured, prior, weights)
     assert tuple(scorer.name for scorer, _ in listed) == ("inliers", "similarity", "likelihood", *names)
     assert all(weight == getattr(weights, scorer.name) for scorer, weight in listed)
-    assert all(isinstance(scorer, Scorer) for scorer in (structure, brightness, *(scorer for scorer, _ in listed)))
-    for each in (structure, brightness):
+    assert all(
+        isinstance(scorer, Scorer) for scorer in (structure, brightness, rays, *(scorer for scorer, _ in listed))
+    )
+    for each in (structure, brightness, rays):
         assert each.score(()).values.shape == (0,)
 
 
@@ -112,6 +122,7 @@ def test_only_candidates_near_the_best_get_a_structure_and_the_others_stay_behin
         return Scores(nats, {"shared_edges": nats / 10})
 
     monkeypatch.setattr(StructureScorer, "score", structure)
+    monkeypatch.setattr(RayScorer, "score", lambda _, poses: Scores(np.zeros(len(poses))))
     scorer = scorer_of((InlierScorer(), 1.0))
     first, second, third = (
         replace(each, support=support)
@@ -121,10 +132,68 @@ def test_only_candidates_near_the_best_get_a_structure_and_the_others_stay_behin
     assert asked == [first.registered, second.registered]
     assert [each.support for each in found] == [17.0, 14.0, 3.0]
     assert [each.registered for each in found] == [second.registered, first.registered, third.registered]
-    assert found[0].scores == {**second.scores, "structure": 6.0, "shared_edges": 0.6}
+    assert found[0].scores == {**second.scores, "structure": 6.0, "shared_edges": 0.6, "rays": 0.0}
     assert "structure" not in found[2].scores
 
 
-def test_candidates_with_brightness_must_have_a_structure():
-    with pytest.raises(ValueError, match=r"brightness_gap: 9 must be at most structure_gap \(8\)"):
-        SupportWeights(brightness_gap=9.0)
+def placed(each, *, x, support):
+    """Return a candidate with another x and another support; it has a structure."""
+    T = each.T_map_camera.copy()
+    T[:3, 3] = (x, 0.0, 1.5)
+    registered = replace(each.registered, camera_m=T[:3, 3].copy())
+    return replace(
+        each, T_map_camera=T, registered=registered, support=support, scores={**each.scores, "structure": 0.0}
+    )
+
+
+@pytest.fixture
+def ray_scores(monkeypatch, scorer_of, poses):
+    """Score candidates at some positions and with some supports by given ray scores; return them and the positions that were asked."""
+
+    def ranked(at, nats):
+        asked = []
+
+        def rays(_, poses):
+            asked.extend(float(pose.camera_m[0]) for pose in poses)
+            return Scores(np.array(nats[: len(poses)], np.float64))
+
+        monkeypatch.setattr(StructureScorer, "score", lambda _, poses: Scores(np.zeros(len(poses))))
+        monkeypatch.setattr(RayScorer, "score", rays)
+        scorer = scorer_of((InlierScorer(), 1.0))
+        template = scorer.candidates(poses[:1])[0]
+        found = scorer.with_details([placed(template, x=x, support=support) for x, support in at])
+        return [(float(each.T_map_camera[0, 3]), each.support) for each in found], asked
+
+    return ranked
+
+
+def test_the_rays_compare_each_place_once_and_reorder_the_candidates(ray_scores):
+    """0.5 m further is the same place. The rays prefer the third candidate: 8 + 9 nats to 10 + 3. The last one is not compared."""
+    found, asked = ray_scores([(0.0, 10.0), (0.5, 9.0), (20.0, 8.0), (40.0, 1.0)], [3.0, 9.0])
+    assert asked == [0.0, 20.0]
+    assert found == [(20.0, 17.0), (0.0, 13.0), (0.5, 12.0), (40.0, 4.0)]
+
+
+def test_one_place_needs_no_rays(ray_scores):
+    found, asked = ray_scores([(0.0, 10.0), (0.5, 9.0), (20.0, 1.0)], [])
+    assert asked == []
+    assert found == [(0.0, 10.0), (0.5, 9.0), (20.0, 1.0)]
+
+
+def test_of_many_places_only_the_best_supported_are_compared_and_the_others_get_the_least(ray_scores):
+    at = [(10.0 * k, 10.0 - k) for k in range(6)]
+    found, asked = ray_scores(at, [5.0, 4.0, 3.0, 2.0])
+    assert asked == [0.0, 10.0, 20.0, 30.0]
+    assert found == [(0.0, 15.0), (10.0, 13.0), (20.0, 11.0), (30.0, 9.0), (40.0, 8.0), (50.0, 7.0)]
+
+
+@pytest.mark.parametrize(
+    ("name", "weights"),
+    [
+        ("brightness_gap", lambda: SupportWeights(brightness_gap=9.0)),
+        ("rays_gap", lambda: SupportWeights(rays_gap=9.0)),
+    ],
+)
+def test_compared_candidates_must_have_a_structure(name, weights):
+    with pytest.raises(ValueError, match=rf"{name}: 9 must be at most structure_gap \(8\)"):
+        weights()
