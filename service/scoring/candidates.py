@@ -28,8 +28,8 @@ class Candidate:
         T_map_camera: pose of the reference camera.
         registered: result of the solver. For the best candidate the ray adjustment then moves the pose by centimetres. Its
             scores below come from before this adjustment.
-        scores: scores of all scorers and their details, by name. ``structure``, its details and
-            ``brightness`` are missing if they were not computed. The best candidate always has its structure.
+        scores: scores of all scorers and their details, by name. ``structure``, its details,
+            ``brightness`` and ``rays`` are missing if they were not computed. The best candidate always has its structure.
         support: weighted sum of the scores, in nats; only differences between candidates have a meaning.
         covariance: of ``T_map_camera``, if the candidate is right: translation (m), then rotation (rad), in map axes, about the
             camera. None if not computed.

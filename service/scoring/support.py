@@ -175,7 +175,7 @@ class PoseScorer:
         """Add the comparison along the rays to the support, if the leading candidates are at several places.
 
         Only the best supported candidate of each place is compared. The others there get its score, because the adjustment moves them to
-        the same pose.
+        the same pose. Candidates elsewhere get the lowest score in their support.
         """
         leading = _leading(candidates, self.weights.rays_gap)
         places = list[Candidate]()
@@ -186,11 +186,13 @@ class PoseScorer:
             return candidates
         compared = places[: self.weights.rays_most]
         values = self.rays.score(tuple(each.registered for each in compared)).values.tolist()
-        rescored = []
-        for each in candidates:
-            known = (value for other, value in zip(compared, values, strict=True) if is_same_place(each, other))
-            value = next(known, min(values)) if each in leading else min(values)
-            rescored.append(replace(each, support=each.support + value, scores={**each.scores, self.rays.name: value}))
+        rescored = [replace(each, support=each.support + min(values)) for each in candidates]
+        for k, each in enumerate(leading):
+            for other, value in zip(compared, values, strict=True):
+                if is_same_place(each, other):
+                    scores = {**each.scores, self.rays.name: value}
+                    rescored[k] = replace(each, support=each.support + value, scores=scores)
+                    break
         return sorted(rescored, key=lambda candidate: -candidate.support)
 
     def select_local_optimum(self, best: Candidate, near: list[LocalPose]) -> Candidate:

@@ -148,7 +148,8 @@ def placed(each, *, x, support):
 
 @pytest.fixture
 def ray_scores(monkeypatch, scorer_of, poses):
-    """Score candidates at some positions and with some supports by given ray scores; return them and the positions that were asked."""
+    """Score candidates at some positions and with some supports by given ray scores; return them, the positions that
+    were asked, and those that have a ray score."""
 
     def ranked(at, nats):
         asked = []
@@ -162,28 +163,30 @@ def ray_scores(monkeypatch, scorer_of, poses):
         scorer = scorer_of((InlierScorer(), 1.0))
         template = scorer.candidates(poses[:1])[0]
         found = scorer.with_details([placed(template, x=x, support=support) for x, support in at])
-        return [(float(each.T_map_camera[0, 3]), each.support) for each in found], asked
+        known = [float(each.T_map_camera[0, 3]) for each in found if "rays" in each.scores]
+        return [(float(each.T_map_camera[0, 3]), each.support) for each in found], asked, known
 
     return ranked
 
 
 def test_the_rays_compare_each_place_once_and_reorder_the_candidates(ray_scores):
     """0.5 m further is the same place. The rays prefer the third candidate: 8 + 9 nats to 10 + 3. The last one is not compared."""
-    found, asked = ray_scores([(0.0, 10.0), (0.5, 9.0), (20.0, 8.0), (40.0, 1.0)], [3.0, 9.0])
+    found, asked, known = ray_scores([(0.0, 10.0), (0.5, 9.0), (20.0, 8.0), (40.0, 1.0)], [3.0, 9.0])
     assert asked == [0.0, 20.0]
+    assert known == [20.0, 0.0, 0.5]
     assert found == [(20.0, 17.0), (0.0, 13.0), (0.5, 12.0), (40.0, 4.0)]
 
 
 def test_one_place_needs_no_rays(ray_scores):
-    found, asked = ray_scores([(0.0, 10.0), (0.5, 9.0), (20.0, 1.0)], [])
-    assert asked == []
+    found, asked, known = ray_scores([(0.0, 10.0), (0.5, 9.0), (20.0, 1.0)], [])
+    assert asked == known == []
     assert found == [(0.0, 10.0), (0.5, 9.0), (20.0, 1.0)]
 
 
 def test_of_many_places_only_the_best_supported_are_compared_and_the_others_get_the_least(ray_scores):
     at = [(10.0 * k, 10.0 - k) for k in range(6)]
-    found, asked = ray_scores(at, [5.0, 4.0, 3.0, 2.0])
-    assert asked == [0.0, 10.0, 20.0, 30.0]
+    found, asked, known = ray_scores(at, [5.0, 4.0, 3.0, 2.0])
+    assert asked == known == [0.0, 10.0, 20.0, 30.0]
     assert found == [(0.0, 15.0), (10.0, 13.0), (20.0, 11.0), (30.0, 9.0), (40.0, 8.0), (50.0, 7.0)]
 
 
