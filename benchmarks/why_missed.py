@@ -118,8 +118,8 @@ WHY_MISSED: dict[str, Reason] = {
         "Confidence causes most losses. 52 of 3,000 queries have a forced error above 1 m. 124 answers are refused, and 84 of these are "
         "right: a LOCALIZED answer needs a confidence of 0.9, and 53 of the 84 have 0.65 to 0.9. 12 accepted answers are wrong (0.4 %), by "
         "1 to 2 m. An earlier default reached 0.970, but accepted 29 wrong answers and 8 % of the images of another city. Decision 0165 "
-        "raised the value from 0.936 to 0.947, the encoder of decision 0174 to 0.952, evidence along the rays to 0.954 (0201) and 0.955 (0202). "
-        "Tried: other models, 60 numbers of the image (decision 0165), rivals without similarity (decision 0181)",
+        "raised the value from 0.936 to 0.947, the encoder of decision 0174 to 0.952, evidence along the rays to 0.954 (0201) and "
+        "0.955 (0202). Tried: other models, 60 numbers of the image (decision 0165), rivals without similarity (decision 0181)",
     ),
     "full.paper_city.precise.street_accuracy": Reason(
         0.9853035,
