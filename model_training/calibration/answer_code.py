@@ -15,7 +15,7 @@ CODE = (
     *(f"model_training/calibration/{name}.py" for name in ("collect", "families", "out_of_map", "plans", "rigs")),
 )  # fmt: skip
 #: Endings of the files that count.
-ENDINGS = (".py", ".c", ".h")
+ENDINGS = (".py", ".c", ".h", ".onnx")
 _ROOT = Path(__file__).resolve().parents[2]
 
 

@@ -35,6 +35,7 @@ _KNOWN = {
     "train": ("Train an encoder on simulated cities.", "training"),
     "average": ("Average the weights of two training runs.", "training"),
     "export": ("Export a trained encoder to ONNX.", "training"),
+    "train-verifier": ("Train the network that compares a pose with the map.", "training"),
     "quantize": ("Quantise an encoder to 8 bits: smaller, faster, nearly equal.", "training"),
 }
 #: Packages without a wheel for every supported platform, as in the markers of ``pyproject.toml``.

@@ -225,6 +225,8 @@ TABLE: tuple[Feature, ...] = (
             lambda e: e.refined.ray_evidence.occlusion_edges, ideal=True),
     Feature("upper_occlusion_edges", "1", "the same for edges of objects above vehicles and people", 1,
             lambda e: e.refined.ray_evidence.upper_occlusion_edges, ideal=True),
+    Feature("verified", "log 1", "log odds of the verifier, a network that compares the image with the map", 1,
+            lambda e: e.refined.verified, ideal=True),
     Feature("inlier_advantage", "1", "share of inliers minus the median of the rivals", 1,
             lambda e: e.inlier_advantage, rivalry=True, ideal=True),
     Feature("unmapped", "1", "share of the points where the map shows nothing", -1, lambda e: e.best.scores["unmapped"],

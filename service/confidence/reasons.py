@@ -51,7 +51,7 @@ GROUPS: tuple[tuple[str, tuple[str, ...], str], ...] = (
     (
         "traffic in the map",
         ("through", "front", "upper_front", "mapped_inliers", "inliers", "upper_inliers", "shared_edges", "contrast", "unmapped",
-         "likelihood", "static_inliers", "upper_through", "occlusion_edges", "upper_occlusion_edges"),
+         "likelihood", "static_inliers", "upper_through", "occlusion_edges", "upper_occlusion_edges", "verified"),
         "look for what was built or moved since the survey; a map that was built with --no-traffic-vote may show passing vehicles",
     ),
     (

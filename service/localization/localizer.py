@@ -18,6 +18,7 @@ from service.retrieval.hypotheses import ClusterSettings
 from service.retrieval.query import Query
 from service.retrieval.retrieve import EncodedFrame, encode_and_search, require_encoder_of, retrieve
 from service.retrieval.starts import start_positions_m
+from service.scoring.verifier import Verifier
 from service.timing import stage, timed_request
 
 
@@ -29,8 +30,10 @@ class Localizer:
         encoder: encoder that computed the map's descriptors.
         clusters: settings of the clustering; None for the defaults.
         refining: settings of registration and scoring; None for the defaults.
+        verifier: network that compares poses with the map; None for the shipped one.
 
     Raises:
+        EncoderError: the shipped verifier is missing or damaged.
         BundleError: the encoder did not compute the map's descriptors, or reads another view grid; or the map's calibration has
             other confidence features.
     """
@@ -42,11 +45,13 @@ class Localizer:
         *,
         clusters: ClusterSettings | None = None,
         refining: RefineSettings | None = None,
+        verifier: Verifier | None = None,
     ) -> None:
         require_encoder_of(bundle, encoder)
         require_features(bundle.calibration, str(bundle.path))
         self.bundle, self.encoder = bundle, encoder
         self.clusters, self.refining = clusters or ClusterSettings(), refining or RefineSettings()
+        self.verifier = verifier or Verifier.shipped()
         self.extent = Extent.of_places(bundle.T_map_place[:, :3, 3], bundle.manifest.spacing_m)
 
     @classmethod
@@ -142,7 +147,11 @@ class Localizer:
             found = retrieve(bundle, frames[0], self.clusters)
         with stage("register"):
             # 2. Registration: refine candidate poses on the map cloud, and rank them.
-            refined = None if cloud is None else refine(bundle, cloud, frames, query.prior, self.refining, predicted)
+            refined = (
+                None
+                if cloud is None
+                else refine(bundle, cloud, frames, query.prior, self.refining, self.verifier, predicted)
+            )
             # 3. Confidence features of the best candidate and its rivals.
             evidence = None if refined is None else evidence_of(frames, refined, found, bundle.places_xy, bundle.grid)
             # 4. Decision: status and calibrated confidence.

@@ -34,10 +34,11 @@ from service.scoring.candidates import Candidate, Refined
 from service.scoring.confirmation import Confirmation, confirm
 from service.scoring.measured import MeasuredFrame, measure, merged_points
 from service.scoring.photometry import BrightnessScorer, PhotometrySettings
-from service.scoring.ray_evidence import RayEvidence, RayScorer
+from service.scoring.ray_evidence import RayPose, RayScorer
 from service.scoring.similarity import similarity_of
 from service.scoring.structure import StructureScorer
 from service.scoring.support import LocalScoreWeights, PoseScorer, SupportWeights, scorers_of
+from service.scoring.verifier import Verifier
 
 _Covariance = Float64[NDArray[np.float64], "6 6"]
 
@@ -92,12 +93,36 @@ def settings_for_rig(settings: RefineSettings, focal_baseline_px_m: float) -> Re
     )
 
 
+def measured_frames(
+    bundle: Map, frames: tuple[EncodedFrame, ...], settings: RefineSettings
+) -> tuple[tuple[MeasuredFrame, ...], RefineSettings]:
+    """Prepare the depth of image pairs; return it and the settings for their rig.
+
+    Args:
+        bundle: the map.
+        frames: image pairs, the reference first.
+        settings: settings of registration and scoring.
+    """
+    rig_px_m = frames[0].query.focal_baseline_px_m
+    if rig_px_m is not None:
+        settings = settings_for_rig(settings, rig_px_m)
+    measured = measure(
+        frames,
+        settings.points,
+        focal_baseline_px_m=settings.focal_baseline_px_m,
+        is_rig=rig_px_m is not None,
+        surveyed_height_m=bundle.manifest.surveyed_height_m,
+    )
+    return measured, settings
+
+
 def refine(
     bundle: Map,
     cloud: Cloud,
     frames: tuple[EncodedFrame, ...],
     prior: Prior | None,
     settings: RefineSettings,
+    verifier: Verifier,
     predicted: tuple[Transform, ...] = (),
 ) -> Refined | None:
     """Register image pairs on the map cloud; return None if they have too few points.
@@ -108,20 +133,12 @@ def refine(
         frames: image pairs, the reference first.
         prior: prior of the reference pose; None if nothing is known.
         settings: settings of registration and scoring.
+        verifier: network that compares a pose with the map.
         predicted: further starts T_map_camera of the reference, for example from odometry. They compete like all others.
     """
     reference = frames[0]
-    rig_px_m = reference.query.focal_baseline_px_m
-    if rig_px_m is not None:
-        settings = settings_for_rig(settings, rig_px_m)
     # 1. Points of all frames, in the level frame of the reference.
-    measured = measure(
-        frames,
-        settings.points,
-        focal_baseline_px_m=settings.focal_baseline_px_m,
-        is_rig=rig_px_m is not None,
-        surveyed_height_m=bundle.manifest.surveyed_height_m,
-    )
+    measured, settings = measured_frames(bundle, frames, settings)
     points = merged_points(measured)
     if len(points) < settings.fewest_points:
         return None
@@ -130,7 +147,7 @@ def refine(
     found = register(cloud, points, starts, reference.views.height_m, settings.registration)
     # 3. Scores, and other local minima around the best pose.
     raycasters = Raycasters(cloud, settings.rays)
-    scorer = _scorer_of(bundle, cloud, raycasters, measured, prior, settings)
+    scorer = _scorer_of(bundle, cloud, raycasters, measured, prior, settings, verifier)
     candidates = scorer.with_details(scorer.candidates(found))
     independent = float(np.median([frame.independent_noise for frame in frames]))
     if scorer.brightness.is_known and independent >= settings.around.from_noise:
@@ -159,7 +176,9 @@ def refine(
         points=len(points),
         variance_inflation=variance_inflation(final.pose.information, final.scatter),
         confirmation=final.confirmation,
-        ray_evidence=final.ray_evidence,
+        ray_evidence=final.along.evidence,
+        verified=final.along.verified,
+        compared=scorer.rays.compared,
         covariance_at=covariance_at,
     )
 
@@ -171,6 +190,7 @@ def _scorer_of(
     measured: tuple[MeasuredFrame, ...],
     prior: Prior | None,
     settings: RefineSettings,
+    verifier: Verifier,
 ) -> PoseScorer:
     """Return the scorer of the candidates of one query."""
     return PoseScorer(
@@ -178,7 +198,7 @@ def _scorer_of(
         scorers_of(bundle, cloud, measured, prior, settings.support),
         StructureScorer(cloud, measured, settings.support.structure),
         BrightnessScorer(raycasters, measured, settings.photometry),
-        RayScorer(raycasters, measured, settings.rays, settings.support.rays),
+        RayScorer(raycasters, measured, settings.rays, settings.support.rays, settings.photometry, verifier),
         settings.support,
         settings.near,
     )
@@ -204,7 +224,7 @@ class _Adjusted:
     T_map_camera: Transform
     scatter: Float64[NDArray[np.float64], "8 8"]
     confirmation: Confirmation
-    ray_evidence: RayEvidence
+    along: RayPose
     covariance: _Covariance
 
 
@@ -235,7 +255,7 @@ def _adjusted(
             along_residual=confirmation.along_residual,
         )
         covariance = covariance_of(pose.information, scatter, noise, heading, OF_RAYS, stability)
-    return _Adjusted(pose, T_map_camera, scatter, confirmation, along.evidence, covariance)
+    return _Adjusted(pose, T_map_camera, scatter, confirmation, along, covariance)
 
 
 def _starts(

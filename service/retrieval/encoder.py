@@ -1,20 +1,16 @@
 """The encoder under ONNX Runtime: from the planes of a view to a unit descriptor."""
 
 import hashlib
-import os
 from pathlib import Path
 from typing import Literal
 
 import numpy as np
-
-# Otherwise the import of ONNX Runtime writes a device id and an event file into the home folder of the user.
-os.environ.setdefault("ORT_DISABLE_TELEMETRY", "1")
-import onnxruntime
 from jaxtyping import Float32
 from numpy.typing import NDArray
 
 from service.errors import EncoderError
 from service.imaging.view_grid import PLANES
+from service.onnx_session import THREADS, Session, installed_providers, session_of
 
 Side = Literal["survey", "query"]
 Descriptors = Float32[NDArray[np.float32], "B D"]
@@ -28,8 +24,6 @@ _PROVIDERS: dict[Provider, str] = {
 }
 #: Package that contains each provider. It replaces ``onnxruntime``.
 _PACKAGES: dict[Provider, str] = {"cpu": "onnxruntime", "cuda": "onnxruntime-gpu", "openvino": "onnxruntime-openvino"}
-#: Threads of one run. The service runs whole requests in parallel, and inner thread pools would compete with them.
-THREADS = 1
 
 
 class Encoder:
@@ -51,7 +45,7 @@ class Encoder:
         EncoderError: the inputs, the outputs or the number of planes are not those of a Streetfix encoder.
     """
 
-    def __init__(self, session: onnxruntime.InferenceSession, sha256: str) -> None:
+    def __init__(self, session: Session, sha256: str) -> None:
         self._session = session
         self.sha256 = sha256
         inputs = {i.name: list(i.shape) for i in session.get_inputs()}
@@ -88,13 +82,8 @@ class Encoder:
             data = source if isinstance(source, bytes) else source.read_bytes()
         except OSError as error:  # the text of the error names the file
             raise EncoderError(f"the encoder cannot be read ({error}); check the path", field="encoder") from error
-        options = onnxruntime.SessionOptions()
-        options.intra_op_num_threads = threads
-        options.inter_op_num_threads = 1
-        options.add_session_config_entry("session.intra_op.allow_spinning", "0")
-        options.log_severity_level = 3
         try:
-            session = onnxruntime.InferenceSession(data, options, providers=[_PROVIDERS[provider]])
+            session = session_of(data, threads=threads, provider=_PROVIDERS[provider])
         except Exception as error:  # the exceptions of ONNX Runtime have no common base class
             raise EncoderError(
                 f"ONNX Runtime cannot load the encoder ({error}); export it with `streetfix export`", field="encoder"
@@ -125,7 +114,7 @@ def require_provider(provider: Provider) -> None:
     Raises:
         EncoderError: the provider is not installed. The error names the installed ones.
     """
-    available = onnxruntime.get_available_providers()
+    available = installed_providers()
     if _PROVIDERS[provider] not in available:
         known = ", ".join(name for name, full in _PROVIDERS.items() if full in available)
         raise EncoderError(

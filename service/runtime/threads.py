@@ -79,6 +79,6 @@ def pools() -> dict[str, int]:
     import cv2
     import faiss
 
-    from service.retrieval.encoder import THREADS
+    from service.onnx_session import THREADS
 
     return {"opencv": cv2.getNumThreads(), "openmp": faiss.omp_get_max_threads(), "onnxruntime": THREADS}

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from service.geometry.rigid import Transform
 from service.registration.register import Registered
 from service.scoring.confirmation import Confirmation
-from service.scoring.ray_evidence import RayEvidence
+from service.scoring.ray_evidence import RayEvidence, RayPose
 
 #: Two candidates are rivals beyond this distance or this angle. Adjacent positions on one street are not rivals.
 RIVAL_M, RIVAL_RAD = 3.0, float(np.deg2rad(30.0))
@@ -64,6 +64,8 @@ class Refined:
         variance_inflation: how much the image patches disagree about the best pose: ratio of variances to those of their noise.
         confirmation: comparison of the best pose with poses next to it.
         ray_evidence: comparison of the depth with the map along the rays of the best pose.
+        verified: log odds of the verifier that the best pose is right.
+        compared: all poses that were compared along the rays, for the training of the verifier.
         covariance_at: function that computes the covariance of a candidate without ray adjustment: of every one but the best.
     """
 
@@ -74,6 +76,8 @@ class Refined:
     variance_inflation: float
     confirmation: Confirmation
     ray_evidence: RayEvidence
+    verified: float
+    compared: tuple[RayPose, ...]
     covariance_at: Callable[[Candidate], Float64[NDArray[np.float64], "6 6"]]
 
     @property

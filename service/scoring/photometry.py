@@ -98,10 +98,10 @@ def agreement_of_brightness(
         grey: logarithmic grey levels, as ``grey_of`` returns them.
         settings: of the score.
     """
-    return squared_correlation(_rendered(surfels, surfel_of, settings), grey, settings)
+    return squared_correlation(mapped_brightness(surfels, surfel_of, settings), grey, settings)
 
 
-def _rendered(
+def mapped_brightness(
     surfels: Surfels,
     surfel_of: Int32[NDArray[np.int32], "H W"],
     settings: PhotometrySettings,

@@ -6,19 +6,24 @@ higher, and it is still there. Rays also resolve more than the image of ``struct
 Right and wrong answers have the same numbers in simulated cities and on KITTI drive 0005 (decision 0201).
 """
 
+from collections.abc import Sequence
 from dataclasses import astuple, dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float32, Float64
+from jaxtyping import Bool, Float64
 from numpy.typing import NDArray
 
 from service.registration.points import GROUND_M, MOVABLE_M
 from service.registration.rays import RaySettings, adjust
 from service.registration.register import Registered
-from service.registration.visibility import Raycasters, SurfelRaycaster
+from service.registration.visibility import Raycasters
+from service.scoring.comparison import Comparison, FrameCells, comparison_of
 from service.scoring.measured import MeasuredFrame
+from service.scoring.photometry import PhotometrySettings
+from service.scoring.ray_image import RayImage, inverse_of, ray_images_of
 from service.scoring.scorer import Scores
-from service.scoring.structure import HALF_PIXELS, INLIER_SIGMAS, LEAST_STRETCH, MOST_SIGMAS, SURFACE_M, near_edges
+from service.scoring.structure import HALF_PIXELS, INLIER_SIGMAS, MOST_SIGMAS, near_edges
+from service.scoring.verifier import Verifier
 
 #: A depth edge between two horizontal neighbours: the farther one is farther by more than EDGE_M plus EDGE_SHARE of the nearer depth, m.
 EDGE_M, EDGE_SHARE = 1.0, 0.05
@@ -58,35 +63,13 @@ class RayWeights:
     occlusion_edges: float = 13.0
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class RayImage:
-    """Depth of one frame and of the map along the same rays.
-
-    Attributes:
-        z_m: measured depth, corrected by the scale and the disparity offset of the pose, m; 0 where nothing was measured.
-        mapped_m: depth of the map, m; 0 where the ray meets no surface.
-        sigma: standard deviation of the difference of the inverse depths, 1/m.
-        climb: height that a ray gains for each metre of depth.
-        camera_m: height of the camera above the ground, m.
-    """
-
-    z_m: Float64[NDArray[np.float64], "H W"]
-    mapped_m: Float64[NDArray[np.float64], "H W"]
-    sigma: Float64[NDArray[np.float64], "H W"]
-    climb: Float64[NDArray[np.float64], "H W"]
-    camera_m: float
-
-
-def ray_evidence(raycaster: SurfelRaycaster, measured: tuple[MeasuredFrame, ...], pose: Registered) -> RayEvidence:
+def ray_evidence(images: Sequence[RayImage]) -> RayEvidence:
     """Compute the numbers of a pose.
 
     Args:
-        raycaster: ray casting on the map.
-        measured: frames of the query that have points, at least one.
-        pose: registered pose of the reference's level frame.
+        images: depth of each frame and of the map along the same rays, at least one.
     """
-    found = [astuple(ray_evidence_of(_ray_image(raycaster, each, each.pose(pose)))) for each in measured]
-    return RayEvidence(*np.mean(found, axis=0).tolist())
+    return RayEvidence(*np.mean([astuple(ray_evidence_of(image)) for image in images], axis=0).tolist())
 
 
 def ray_evidence_of(image: RayImage) -> RayEvidence:
@@ -98,7 +81,7 @@ def ray_evidence_of(image: RayImage) -> RayEvidence:
     known, hit = image.z_m > 0, image.mapped_m > 0
     both = known & hit
     height_m, mapped_height_m = (z * image.climb + image.camera_m for z in (image.z_m, image.mapped_m))
-    sigmas = np.where(both, (_inverse(image.z_m) - _inverse(image.mapped_m)) / image.sigma, 0.0)
+    sigmas = np.where(both, (inverse_of(image.z_m) - inverse_of(image.mapped_m)) / image.sigma, 0.0)
     through, front = sigmas < -MOST_SIGMAS, sigmas > MOST_SIGMAS
     raised, upper, mapped_upper = height_m > GROUND_M, height_m > MOVABLE_M, mapped_height_m >= MOVABLE_M
     left = through & (mapped_height_m > GROUND_M) & ~mapped_upper
@@ -164,31 +147,6 @@ def _shared(
     return float(shared) / (float(edges.sum() + others.sum()) + HALF_PIXELS)
 
 
-def _ray_image(raycaster: SurfelRaycaster, measured: MeasuredFrame, pose: Registered) -> RayImage:
-    """Return the depth of a frame, corrected as its registration estimates, and that of the map along the same rays."""
-    frame, picture = measured.frame, measured.picture
-    camera, T = picture.camera, frame.pose_of_camera(pose.T_map_level)
-    T[:3, 3] -= raycaster.cloud.origin_m
-    mapped_m = raycaster.depth(T, camera)
-    per_offset = 0.0 if picture.focal_baseline_px_m is None else pose.offset / picture.focal_baseline_px_m
-    inverse = picture.inverse.astype(np.float64)
-    corrected = np.maximum(inverse + per_offset, LEAST_STRETCH * inverse) / pose.scale
-    return RayImage(
-        z_m=_inverse(np.where(inverse > 0, corrected, 0.0)),
-        mapped_m=mapped_m,
-        sigma=frame.noise + SURFACE_M * _inverse(mapped_m) ** 2,
-        climb=camera.rays_of_pixels() @ frame.R_level_camera[2],
-        camera_m=frame.views.height_m,
-    )
-
-
-def _inverse(
-    values: Float32[NDArray[np.float32], "H W"] | Float64[NDArray[np.float64], "H W"],
-) -> Float64[NDArray[np.float64], "H W"]:
-    """Return the inverse of each value, 0 for 0."""
-    return np.divide(1.0, values, out=np.zeros(values.shape), where=values > 0)
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class RayPose:
     """A registered pose after its adjustment along the rays.
@@ -197,11 +155,15 @@ class RayPose:
         pose: the adjusted pose, or the registered one if too few rays meet the map.
         scatter: scatter of the patches' gradients there, as ``adjust`` returns it; None if the pose was not adjusted.
         evidence: comparison with the map along the rays of this pose.
+        comparisons: the same for the verifier, for each frame.
+        verified: mean log odds of the frames, by the verifier, that the pose is right.
     """
 
     pose: Registered
     scatter: Float64[NDArray[np.float64], "8 8"] | None
     evidence: RayEvidence
+    comparisons: tuple[Comparison, ...]
+    verified: float
 
 
 class RayScorer:
@@ -214,17 +176,32 @@ class RayScorer:
         measured: frames of the query, the reference first.
         settings: settings of the ray adjustment.
         weights: weights of the numbers.
+        photometry: settings of the brightness, for the verifier.
+        verifier: the verifier.
     """
 
     name = "rays"
 
     def __init__(
-        self, raycasters: Raycasters, measured: tuple[MeasuredFrame, ...], settings: RaySettings, weights: RayWeights
+        self,
+        raycasters: Raycasters,
+        measured: tuple[MeasuredFrame, ...],
+        settings: RaySettings,
+        weights: RayWeights,
+        photometry: PhotometrySettings,
+        verifier: Verifier,
     ) -> None:
         self._raycasters, self._settings, self._weights = raycasters, settings, weights
+        self._photometry, self._verifier = photometry, verifier
         self._pictures = [each.picture for each in measured]
         self._measured = tuple(each for each in measured if len(each.points))
+        self._cells = tuple(FrameCells.of(each, photometry) for each in self._measured)
         self._known: list[tuple[Registered, RayPose]] = []
+
+    @property
+    def compared(self) -> tuple[RayPose, ...]:
+        """All poses that were compared so far."""
+        return tuple(found for _, found in self._known)
 
     def at(self, pose: Registered) -> RayPose:
         """Adjust a pose along the rays, and compare it with the map there. A pose that was adjusted before is not adjusted again.
@@ -237,7 +214,13 @@ class RayScorer:
                 return found
         raycaster = self._raycasters.at(pose.camera_m)
         adjusted, scatter = adjust(raycaster, self._pictures, pose, self._settings) or (pose, None)
-        found = RayPose(adjusted, scatter, ray_evidence(raycaster, self._measured, adjusted))
+        images = ray_images_of(raycaster, self._measured, adjusted)
+        comparisons = tuple(
+            comparison_of(cells, image, raycaster.cloud, self._photometry)
+            for cells, image in zip(self._cells, images, strict=True)
+        )
+        verified = float(self._verifier.log_odds(comparisons).mean())
+        found = RayPose(adjusted, scatter, ray_evidence(images), comparisons, verified)
         self._known.append((pose, found))
         return found
 

@@ -51,6 +51,7 @@ def test_features_beyond_the_range_are_named_the_farthest_first(calibration_with
         ("static_inliers", True, False),
         ("occlusion_edges", True, False),
         ("upper_occlusion_edges", True, False),
+        ("verified", True, False),
         ("points", True, True),
     ],
 )

@@ -24,11 +24,22 @@ from service.scoring.ray_evidence import RayEvidence
 CONFIRMATION = Confirmation(upper_front=0.03, contrast=0.2, along_residual=1.7, along_edges=0.1)
 RAYS = RayEvidence(static_inliers=0.92, upper_through=0.04, occlusion_edges=0.35, upper_occlusion_edges=0.45)
 
+VERIFIED = 4.5
+
 
 def refined(*candidates, covariance=None, points=1500, variance_inflation=1.0):
     own = np.eye(6) if covariance is None else covariance
     return Refined(
-        candidates, own + np.eye(6), own, points, variance_inflation, CONFIRMATION, RAYS, lambda _: np.eye(6)
+        candidates,
+        own + np.eye(6),
+        own,
+        points,
+        variance_inflation,
+        CONFIRMATION,
+        RAYS,
+        VERIFIED,
+        (),
+        lambda _: np.eye(6),
     )
 
 
@@ -87,6 +98,7 @@ def weighed(candidate, frame):
         ("upper_through", 0.04),
         ("occlusion_edges", 0.35),
         ("upper_occlusion_edges", 0.45),
+        ("verified", 4.5),
     ],
 )
 def test_features_of_the_best_candidate_are_unchanged(candidate, weighed, name, expected):

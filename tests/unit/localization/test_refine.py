@@ -26,11 +26,12 @@ from service.scoring import ray_evidence as along_rays
 from service.scoring import similarity as similar
 from service.scoring.measured import measure
 from service.scoring.photometry import BrightnessScorer
-from service.scoring.ray_evidence import RayWeights, ray_evidence
+from service.scoring.ray_evidence import RayWeights
 from service.scoring.scorer import Scores
 from service.scoring.similarity import similarity_of
 from service.scoring.structure import StructureWeights
 from service.scoring.support import LocalScoreWeights, SupportWeights
+from service.scoring.verifier import Verifier
 
 CAMERA = PinholeCamera(80, 60, 50.0, 50.0, 39.5, 29.5)
 R_LEVEL_CAMERA = rotation_y(np.deg2rad(4.0)) @ R_BODY_OPTICAL
@@ -110,7 +111,7 @@ def seen_in(frame_with):
 
 def always_refined(bundle, cloud, frames, prior, settings):
     """Refine, and require at least one candidate."""
-    found = refine(bundle, cloud, frames, prior, settings)
+    found = refine(bundle, cloud, frames, prior, settings, Verifier.shipped())
     assert found is not None
     return found
 
@@ -123,9 +124,8 @@ NO_DETAILS = {
 
 def refined(bundle, cloud, *frames, prior=None, **weights):
     support = SupportWeights(**{**NO_DETAILS, **weights}) if weights else SupportWeights()
-    return refine(
-        bundle, cloud, frames, prior, RefineSettings(starts=EVERY_VIEW, support=support, registration=BY_INLIERS)
-    )
+    settings = RefineSettings(starts=EVERY_VIEW, support=support, registration=BY_INLIERS)
+    return refine(bundle, cloud, frames, prior, settings, Verifier.shipped())
 
 
 ONLY_INLIERS = {"inliers": 1.0, "similarity": 0.0, "likelihood": 0.0}
@@ -456,18 +456,11 @@ def test_the_best_supported_candidate_is_adjusted_and_its_covariance_is_that_of_
     np.testing.assert_array_equal(found.covariance, expected + relative_pose_covariance(3))
 
 
-def test_the_evidence_along_the_rays_is_that_of_the_final_pose(bundle, cloud, depth, here, seen_in, monkeypatch):
-    kept, asked = ray_evidence, []
-
-    def call(*given):
-        asked.append(given)
-        return kept(*given)
-
-    monkeypatch.setattr(along_rays, "ray_evidence", call)
+def test_the_evidence_along_the_rays_is_that_of_the_final_pose(bundle, cloud, depth, here, seen_in):
     found = always_refined(bundle, cloud, (seen_in(depth, here),), None, RefineSettings())
-    ((_, _, pose),) = asked
-    assert pose is found.best.registered
-    assert found.ray_evidence == kept(*asked[0])
+    (final,) = [each for each in found.compared if each.pose is found.best.registered]
+    assert found.ray_evidence == final.evidence
+    assert found.verified == final.verified
     assert found.ray_evidence.static_inliers > 0.5
 
 

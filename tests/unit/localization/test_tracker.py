@@ -50,6 +50,8 @@ def found(confidence: float, *places: tuple[float, float], known: float | None =
         1.0,
         Confirmation(0.0, 0.2, 1.7, 0.1),
         RayEvidence(0.9, 0.0, 0.3, 0.3),
+        3.0,
+        (),
         lambda _: SMALL,
     )
     known = max(confidence, 0.98) if known is None else known

@@ -12,7 +12,10 @@ from service.registration.surfel_map import SurfelMap
 from service.registration.visibility import Raycasters, SurfelRaycaster
 from service.scoring import ray_evidence as along_rays
 from service.scoring.measured import measure
-from service.scoring.ray_evidence import RayImage, RayScorer, RayWeights, ray_evidence, ray_evidence_of
+from service.scoring.photometry import PhotometrySettings
+from service.scoring.ray_evidence import RayScorer, RayWeights, ray_evidence, ray_evidence_of
+from service.scoring.ray_image import RayImage, ray_images_of
+from service.scoring.verifier import Verifier
 
 #: 60 columns and 40 rows, 1.5 m above the ground. A ray of row r gains (19.5 - r) / 20 m for each metre of depth.
 SHAPE = (40, 60)
@@ -22,6 +25,7 @@ CAMERA_M = 1.5
 
 def image(z_m, mapped_m, sigma=1e-3):
     return RayImage(
+        surfel_of=np.zeros(SHAPE, np.int32),
         z_m=np.asarray(z_m, float),
         mapped_m=np.asarray(mapped_m, float),
         sigma=np.full(SHAPE, sigma),
@@ -130,6 +134,17 @@ def test_the_numbers_are_shares(seed, sigma):
     assert max(found) < 1
 
 
+def evidence_at(raycaster, measured, pose):
+    return ray_evidence(ray_images_of(raycaster, measured, pose))
+
+
+def scorer_of(street_map, measured, settings=None):
+    settings = settings or RaySettings()
+    return RayScorer(
+        Raycasters(street_map, settings), measured, settings, RayWeights(), PhotometrySettings(), Verifier.shipped()
+    )
+
+
 @pytest.fixture
 def raycaster(street_map):
     return SurfelRaycaster(street_map, RaySettings())
@@ -147,7 +162,7 @@ def measured(frame_with, matches_at, candidate, raycaster):
 
 def test_the_map_is_seen_from_the_pose(raycaster, measured, candidate):
     right, beside, turned = (
-        ray_evidence(raycaster, measured, candidate(xyz=xyz, heading_deg=heading).registered)
+        evidence_at(raycaster, measured, candidate(xyz=xyz, heading_deg=heading).registered)
         for xyz, heading in (((0.0, 0.0, 1.5), 0.0), ((0.0, 1.5, 1.5), 0.0), ((0.0, 0.0, 1.5), 20.0))
     )
     assert right.static_inliers > 0.95
@@ -160,8 +175,8 @@ def test_the_map_is_seen_from_the_pose(raycaster, measured, candidate):
 
 def test_the_surfels_have_an_origin_of_their_own(street, raycaster, measured, candidate):
     away = SurfelRaycaster(SurfelMap.prepare(np.array([100.0, -50.0, 3.0]), street.surfels()), RaySettings())
-    expected = ray_evidence(raycaster, measured, candidate(xyz=(0.0, 0.0, 1.5)).registered)
-    found = ray_evidence(away, measured, candidate(xyz=(100.0, -50.0, 4.5)).registered)
+    expected = evidence_at(raycaster, measured, candidate(xyz=(0.0, 0.0, 1.5)).registered)
+    found = evidence_at(away, measured, candidate(xyz=(100.0, -50.0, 4.5)).registered)
     assert astuple(found) == pytest.approx(astuple(expected), abs=1e-3)
 
 
@@ -169,18 +184,18 @@ def test_the_depth_is_corrected_by_scale_and_offset(raycaster, measured, candida
     """A measured inverse depth of q means (q + offset / focal length times baseline) / scale."""
     pose = candidate(xyz=(0.0, 0.0, 1.5)).registered
     (one,) = measured
-    expected = ray_evidence(raycaster, measured, pose)
+    expected = evidence_at(raycaster, measured, pose)
     inverse = one.picture.inverse
     shown = np.where(inverse > 0, 1.25 * inverse - 0.5 / 80.0, 0).astype(np.float32)
     changed = replace(one, picture=replace(one.picture, inverse=np.maximum(shown, 0)))
-    found = ray_evidence(raycaster, (changed,), replace(pose, scale=1.25, offset=0.5))
+    found = evidence_at(raycaster, (changed,), replace(pose, scale=1.25, offset=0.5))
     assert astuple(found) == pytest.approx(astuple(expected), abs=0.02)
-    assert ray_evidence(raycaster, (changed,), pose).static_inliers < expected.static_inliers - 0.1
+    assert evidence_at(raycaster, (changed,), pose).static_inliers < expected.static_inliers - 0.1
 
 
 @pytest.mark.parametrize("offset", [-1e6, -0.5, 1e6])
 def test_no_offset_makes_a_number_that_is_not_finite(raycaster, measured, candidate, offset):
-    found = astuple(ray_evidence(raycaster, measured, replace(candidate().registered, offset=offset)))
+    found = astuple(evidence_at(raycaster, measured, replace(candidate().registered, offset=offset)))
     assert np.isfinite(found).all()
     assert all(0 <= share < 1 for share in found)
 
@@ -189,7 +204,7 @@ def test_depth_without_a_baseline_has_no_offset(raycaster, measured, candidate):
     pose = candidate(xyz=(0.0, 0.0, 1.5)).registered
     (one,) = measured
     plain = replace(one, picture=replace(one.picture, focal_baseline_px_m=None))
-    assert ray_evidence(raycaster, (plain,), replace(pose, offset=3.0)) == ray_evidence(raycaster, measured, pose)
+    assert evidence_at(raycaster, (plain,), replace(pose, offset=3.0)) == evidence_at(raycaster, measured, pose)
 
 
 def test_another_frame_is_compared_at_its_own_pose(raycaster, frame_with, matches_at, candidate):
@@ -204,21 +219,21 @@ def test_another_frame_is_compared_at_its_own_pose(raycaster, frame_with, matche
         seen = replace(frame.query, depth_m=raycaster.depth(T, camera).astype(np.float32), camera=camera)
         frames.append(replace(frame, query=seen, T_reference_camera=T_reference_camera))
     _, other = measure(tuple(frames), PointSettings(), focal_baseline_px_m=80.0, is_rig=True)
-    assert ray_evidence(raycaster, (other,), pose).static_inliers > 0.95
-    assert ray_evidence(raycaster, (replace(other, is_reference=True),), pose).static_inliers < 0.9
+    assert evidence_at(raycaster, (other,), pose).static_inliers > 0.95
+    assert evidence_at(raycaster, (replace(other, is_reference=True),), pose).static_inliers < 0.9
 
 
 def test_frames_are_averaged(raycaster, measured, candidate):
     pose = candidate(xyz=(0.0, 0.0, 1.5)).registered
     (one,) = measured
     blind = replace(one, is_reference=False, picture=replace(one.picture, inverse=np.zeros_like(one.picture.inverse)))
-    expected = 0.5 * (np.array(astuple(ray_evidence(raycaster, measured, pose))) + (0.5, 0.0, 0.0, 0.0))
-    assert astuple(ray_evidence(raycaster, (one, blind), pose)) == pytest.approx(tuple(expected))
+    expected = 0.5 * (np.array(astuple(evidence_at(raycaster, measured, pose))) + (0.5, 0.0, 0.0, 0.0))
+    assert astuple(evidence_at(raycaster, (one, blind), pose)) == pytest.approx(tuple(expected))
 
 
 def test_the_scorer_weighs_two_numbers_of_the_adjusted_poses(street_map, measured, candidate):
     """The second pose is 0.3 m ahead. Its adjustment moves it to the first."""
-    scorer = RayScorer(Raycasters(street_map, RaySettings()), measured, RaySettings(), RayWeights())
+    scorer = scorer_of(street_map, measured)
     right, ahead, beside = (
         candidate(xyz=xyz).registered for xyz in ((0.0, 0.0, 1.5), (0.3, 0.0, 1.5), (0.0, 12.0, 1.5))
     )
@@ -238,7 +253,7 @@ def test_a_pose_is_adjusted_once(street_map, measured, candidate, monkeypatch):
         return adjust(raycaster, pictures, pose, settings)
 
     monkeypatch.setattr(along_rays, "adjust", counted)
-    scorer = RayScorer(Raycasters(street_map, RaySettings()), measured, RaySettings(), RayWeights())
+    scorer = scorer_of(street_map, measured)
     pose, like_it = candidate(xyz=(0.0, 0.0, 1.5)).registered, candidate(xyz=(0.0, 0.0, 1.5)).registered
     scorer.score((pose,))
     first = scorer.at(pose)
@@ -250,7 +265,7 @@ def test_a_pose_is_adjusted_once(street_map, measured, candidate, monkeypatch):
 def test_a_pose_with_too_few_rays_is_compared_as_it_is(street_map, measured, candidate):
     settings = RaySettings(fewest=10**6)
     pose = candidate(xyz=(0.0, 0.0, 1.5)).registered
-    found = RayScorer(Raycasters(street_map, settings), measured, settings, RayWeights()).at(pose)
+    found = scorer_of(street_map, measured, settings).at(pose)
     assert found.pose is pose
     assert found.scatter is None
-    assert found.evidence == ray_evidence(SurfelRaycaster(street_map, settings), measured, pose)
+    assert found.evidence == evidence_at(SurfelRaycaster(street_map, settings), measured, pose)

@@ -16,6 +16,7 @@ from service.scoring.ray_evidence import RayScorer, RayWeights
 from service.scoring.scorer import Scorer, Scores
 from service.scoring.structure import StructureScorer, StructureWeights
 from service.scoring.support import LocalScoreWeights, PoseScorer, SupportWeights, scorers_of
+from service.scoring.verifier import Verifier
 
 PRIOR = Prior(position_m=np.array([4.0, 0.0]), position_std_m=3.0, heading_rad=0.2)
 
@@ -57,7 +58,14 @@ def structure(street_map, measured):
 
 @pytest.fixture
 def rays(street_map, measured):
-    return RayScorer(Raycasters(street_map, RaySettings()), measured, RaySettings(), RayWeights())
+    return RayScorer(
+        Raycasters(street_map, RaySettings()),
+        measured,
+        RaySettings(),
+        RayWeights(),
+        PhotometrySettings(),
+        Verifier.shipped(),
+    )
 
 
 @pytest.fixture

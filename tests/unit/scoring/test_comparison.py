@@ -1,0 +1,195 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from service.geometry.camera import PinholeCamera
+from service.registration.points import PointSettings
+from service.registration.rays import RaySettings
+from service.registration.visibility import SurfelRaycaster
+from service.scoring.comparison import (
+    AZIMUTH_RAD,
+    COLUMNS,
+    ELEVATION_RAD,
+    PLANES,
+    ROWS,
+    FrameCells,
+    comparison_of,
+)
+from service.scoring.measured import measure
+from service.scoring.photometry import PhotometrySettings
+from service.scoring.ray_image import RayImage, ray_image_of
+
+PHOTOMETRY = PhotometrySettings()
+CAMERA = PinholeCamera(120, 90, 60.0, 60.0, 59.5, 44.5)
+LEVEL = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
+
+
+@pytest.fixture
+def measured_with(frame_with, matches_at):
+    """Return a function that measures a frame with given rotation, images and camera."""
+    frame = frame_with(matches_at([(0, 0, 2)], [0], [0.9]))
+
+    def measured(*, R=LEVEL, depth_m=None, rgb=None, camera=CAMERA):
+        depth_m = np.full((camera.height, camera.width), 8.0, np.float32) if depth_m is None else depth_m
+        rgb = np.full((*depth_m.shape, 3), 90, np.uint8) if rgb is None else rgb
+        query = replace(frame.query, depth_m=depth_m, rgb=rgb, camera=camera)
+        (found,) = measure(
+            (replace(frame, query=query, views=replace(frame.views, R_level_camera=R)),),
+            PointSettings(),
+            focal_baseline_px_m=80.0,
+            is_rig=False,
+        )
+        return found
+
+    return measured
+
+
+def image_of(one, z_m, mapped_m, sigma=0.01):
+    """Return an image of equal rays."""
+    shape = (one.picture.camera.height, one.picture.camera.width)
+    return RayImage(
+        surfel_of=np.full(shape, -1, np.int32),
+        z_m=np.full(shape, float(z_m)),
+        mapped_m=np.full(shape, float(mapped_m)),
+        sigma=np.full(shape, sigma),
+        climb=np.zeros(shape),
+        camera_m=1.5,
+    )
+
+
+def planes(one, street, image):
+    found = comparison_of(FrameCells.of(one, PHOTOMETRY), image, street, PHOTOMETRY)
+    assert found.shape == (len(PLANES), ROWS, COLUMNS)
+    assert found.dtype == np.float32
+    assert np.abs(found).max() <= 1
+    return dict(zip(PLANES, found, strict=True))
+
+
+@pytest.fixture
+def surfels(street_map):
+    return SurfelRaycaster(street_map, RaySettings()).cloud
+
+
+def test_the_middle_of_the_grid_is_the_heading_at_the_horizon(measured_with):
+    """Cells left and right of the middle show pixels on both sides of the optical axis, whatever the heading in the level frame is."""
+    for turn in (0.0, 1.0, -2.5):
+        cos, sin = np.cos(turn), np.sin(turn)
+        one = measured_with(R=np.array([[cos, -sin, 0], [sin, cos, 0], [0, 0, 1]]) @ LEVEL)
+        cells, width = FrameCells.of(one, PHOTOMETRY), one.picture.camera.width
+        rows, columns = np.divmod(
+            cells.pixel[ROWS // 2 - 1 : ROWS // 2 + 1, COLUMNS // 2 - 1 : COLUMNS // 2 + 1], width
+        )
+        centre = one.picture.camera.cx, one.picture.camera.cy
+        assert np.abs(columns - centre[0]).max() <= 1.5
+        assert np.abs(rows - centre[1]).max() <= 1.5
+        assert (np.diff(columns, axis=1) >= 0).all()
+        assert (np.diff(rows, axis=0) >= 0).all()
+
+
+def test_the_grid_has_equal_angles(measured_with):
+    one = measured_with()
+    cells, camera = FrameCells.of(one, PHOTOMETRY), one.picture.camera
+    row, column = 20, 100
+    azimuth = AZIMUTH_RAD * (1 - (2 * column + 1) / COLUMNS)
+    elevation = ELEVATION_RAD * (1 - (2 * row + 1) / ROWS)
+    v, u = divmod(int(cells.pixel[row, column]), camera.width)
+    assert u == round(camera.cx - camera.fx * np.tan(azimuth))
+    assert v == round(camera.cy - camera.fy * np.tan(elevation) / np.cos(azimuth))
+
+
+def test_a_camera_that_looks_down_has_the_same_directions(measured_with):
+    """The horizon moves up in the image, not in the grid."""
+    pitch = np.deg2rad(10.0)
+    down = np.array([[np.cos(pitch), 0, np.sin(pitch)], [0, 1, 0], [-np.sin(pitch), 0, np.cos(pitch)]])
+    one = measured_with(R=down @ LEVEL)
+    cells, camera = FrameCells.of(one, PHOTOMETRY), one.picture.camera
+    v = cells.pixel[ROWS // 2, COLUMNS // 2] // camera.width
+    assert v == pytest.approx(camera.cy - camera.fy * np.tan(pitch), abs=1.5)
+    assert not cells.in_view[-1].any() or cells.in_view.mean() < 1
+
+
+def test_directions_outside_of_the_image_are_empty(measured_with, surfels):
+    narrow = PinholeCamera(120, 90, 240.0, 240.0, 59.5, 44.5)
+    one = measured_with(camera=narrow)
+    found = planes(one, surfels, image_of(one, 8, 8))
+    inside = found["in_view"] > 0
+    assert 0 < inside.mean() < 0.3
+    for plane in found.values():
+        assert (plane[~inside] == 0).all()
+
+
+def test_equal_depth_has_no_difference(measured_with, surfels):
+    one = measured_with()
+    found = planes(one, surfels, image_of(one, 8, 8))
+    inside = found["in_view"] > 0
+    assert (found["measured"][inside] == 1).all()
+    assert (found["mapped"][inside] == 1).all()
+    np.testing.assert_allclose(found["inverse_depth"][inside], (1 / 8) / 0.25)
+    np.testing.assert_allclose(found["mapped_inverse_depth"][inside], (1 / 8) / 0.25)
+    np.testing.assert_allclose(found["height"][inside], 0.15, rtol=1e-6)
+    np.testing.assert_allclose(found["relative_noise"][inside], 0.08, rtol=1e-6)
+    assert (found["difference_sigmas"] == 0).all()
+    assert (found["difference_ratio"] == 0).all()
+
+
+def test_differences_have_the_sign_of_the_nearer_side(measured_with, surfels):
+    """At 4 m instead of 8 m: (1/4 - 1/8) / 0.05 = 2.5 standard deviations, and a ratio of 2."""
+    one = measured_with()
+    found = planes(one, surfels, image_of(one, 4, 8, sigma=0.05))
+    inside = found["in_view"] > 0
+    np.testing.assert_allclose(found["difference_sigmas"][inside], np.tanh(2.5 / 4), rtol=1e-6)
+    np.testing.assert_allclose(found["difference_ratio"][inside], np.tanh(3.0), rtol=1e-6)
+    behind = planes(one, surfels, image_of(one, 16, 8, sigma=0.05))
+    np.testing.assert_allclose(behind["difference_sigmas"][inside], -np.tanh(1.25 / 4), rtol=1e-6)
+
+
+@pytest.mark.parametrize(("z_m", "mapped_m"), [(0, 8), (8, 0), (0, 0)])
+def test_what_is_unknown_is_zero(measured_with, surfels, z_m, mapped_m):
+    one = measured_with()
+    found = planes(one, surfels, image_of(one, z_m, mapped_m))
+    inside = found["in_view"] > 0
+    assert (found["measured"][inside] == (z_m > 0)).all()
+    assert (found["mapped"][inside] == (mapped_m > 0)).all()
+    assert (found["difference_sigmas"] == 0).all()
+    assert (found["difference_ratio"] == 0).all()
+    if z_m == 0:
+        assert (found["height"] == 0).all()
+    if mapped_m == 0:
+        assert (found["mapped_height"] == 0).all()
+        assert (found["relative_noise"] == 0).all()
+
+
+def test_brightness_is_relative_to_the_image(measured_with, surfels):
+    """A bright right half. Twice the light changes nothing but the offset of the logarithm."""
+    rgb = np.full((90, 120, 3), 40, np.uint8)
+    rgb[:, 60:] = 160
+    one, brighter = measured_with(rgb=rgb), measured_with(rgb=rgb // 2)
+    found, same = (planes(each, surfels, image_of(each, 8, 8))["brightness"] for each in (one, brighter))
+    middle = found[ROWS // 2]
+    assert middle[COLUMNS // 2 - 10] < -0.1 < 0.1 < middle[COLUMNS // 2 + 10]
+    np.testing.assert_allclose(found, same, atol=0.06)
+
+
+def test_a_map_without_brightness_has_none(measured_with, street_map):
+    raycaster = SurfelRaycaster(street_map, RaySettings())
+    one = measured_with()
+    found = planes(one, raycaster.cloud, image_of(one, 8, 8))
+    assert (found["mapped_brightness"] == 0).all()
+
+
+def test_the_right_pose_agrees_with_the_map(street_map, frame_with, matches_at, candidate):
+    raycaster = SurfelRaycaster(street_map, RaySettings())
+    frame = frame_with(matches_at([(0, 0, 2)], [0], [0.9]))
+    pose = candidate(xyz=(0.0, 0.0, 1.5)).registered
+    T = frame.pose_of_camera(pose.T_map_level)
+    query = replace(frame.query, depth_m=raycaster.depth(T, CAMERA).astype(np.float32), camera=CAMERA)
+    (one,) = measure((replace(frame, query=query),), PointSettings(), focal_baseline_px_m=80.0, is_rig=True)
+    right, wrong = (
+        planes(one, raycaster.cloud, ray_image_of(raycaster, one, candidate(xyz=xyz).registered))
+        for xyz in ((0.0, 0.0, 1.5), (0.0, 1.5, 1.5))
+    )
+    both = (right["measured"] > 0) & (right["mapped"] > 0)
+    assert both.mean() > 0.3
+    assert (np.abs(right["difference_ratio"][both]) > 0.1).mean() < 0.05
+    assert (np.abs(wrong["difference_ratio"][both]) > 0.1).mean() > 0.2

@@ -1,0 +1,60 @@
+import numpy as np
+import pytest
+
+from model_training.stock import ENCODER
+from service.errors import EncoderError
+from service.scoring.comparison import COLUMNS, PLANES, ROWS
+from service.scoring.verifier import SHIPPED, Verifier
+
+
+def comparison(*, agrees: bool):
+    """Return a street with a wall at 8 m that the map has at the same distance, or at 4 m."""
+    planes = np.zeros((len(PLANES), ROWS, COLUMNS), np.float32)
+    for name in ("measured", "mapped", "in_view"):
+        planes[PLANES.index(name)] = 1
+    planes[PLANES.index("inverse_depth")] = planes[PLANES.index("mapped_inverse_depth")] = 0.5
+    if not agrees:
+        planes[PLANES.index("mapped_inverse_depth")] = 1.0
+        planes[PLANES.index("difference_sigmas")] = planes[PLANES.index("difference_ratio")] = -0.9
+    planes[PLANES.index("relative_noise")] = 0.05
+    return planes
+
+
+def test_the_shipped_verifier_prefers_a_map_that_agrees():
+    right, wrong = Verifier.shipped().log_odds([comparison(agrees=True), comparison(agrees=False)])
+    assert right > wrong + 1
+
+
+def test_comparisons_are_independent_of_each_other_and_of_the_batch():
+    one, other = comparison(agrees=True), comparison(agrees=False)
+    verifier = Verifier.shipped()
+    together = verifier.log_odds([one, other] * 20)
+    assert together.shape == (40,)
+    np.testing.assert_allclose(together[::2], verifier.log_odds([one])[0], atol=1e-4)
+    np.testing.assert_allclose(together[1::2], verifier.log_odds([other])[0], atol=1e-4)
+
+
+def test_an_empty_comparison_has_finite_log_odds():
+    assert np.isfinite(Verifier.shipped().log_odds([np.zeros((len(PLANES), ROWS, COLUMNS), np.float32)])).all()
+
+
+def test_the_shipped_verifier_is_opened_once():
+    assert Verifier.shipped() is Verifier.shipped()
+    assert len(Verifier.open(SHIPPED).sha256) == 64
+
+
+def test_a_missing_file_is_named(tmp_path):
+    with pytest.raises(EncoderError, match=r"absent\.onnx") as refused:
+        Verifier.open(tmp_path / "absent.onnx")
+    assert refused.value.field == "verifier"
+
+
+def test_a_damaged_file_is_named(tmp_path):
+    (tmp_path / "bad.onnx").write_bytes(b"no network")
+    with pytest.raises(EncoderError, match=r"bad\.onnx.*train-verifier"):
+        Verifier.open(tmp_path / "bad.onnx")
+
+
+def test_a_network_with_other_inputs_is_refused():
+    with pytest.raises(EncoderError, match="12 planes of 64 x 128"):
+        Verifier.open(ENCODER)
