@@ -35,7 +35,7 @@ export ORT_DISABLE_TELEMETRY := 1
 .DEFAULT_GOAL := help
 .NOTPARALLEL:
 .DELETE_ON_ERROR:
-.PHONY: help demo demo-real test test-service test-ray check check-native sanitize console check-console test-console format generate release-proto lock evaluate evaluate-real bench-kitti choices paper bench-training bench-serving bench-scale fuzz chaos sbom audit reports docs docs-blocks same-answers house pictures encoder paper-encoder calibration install-demo install-test clean
+.PHONY: help demo demo-real test test-service test-ray check check-native sanitize console check-console test-console format generate release-proto lock evaluate evaluate-real bench-kitti choices paper bench-training bench-serving bench-scale fuzz chaos sbom audit reports docs docs-blocks same-answers house pictures encoder paper-encoder verifier calibration install-demo install-test clean
 
 help: ## list all targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "make %-16s %s\n", $$1, $$2}' Makefile
@@ -197,6 +197,9 @@ encoder: .venv/.torch ## train and export the stock encoder again; resumes an in
 	$(BIN)/streetfix average runs/first runs/second --run runs/mean
 	$(BIN)/streetfix export runs/mean --out runs/mean/encoder.onnx
 	$(BIN)/streetfix quantize runs/mean/encoder.onnx --cities 6 --seed 3 --out model_training/stock/encoder.onnx
+
+verifier: .venv/.torch ## train the verifier again; resumes an interrupted run; fit the calibration afterwards
+	$(BIN)/streetfix train-verifier --out service/scoring/verifier.onnx $(ARGS)
 
 calibration: .venv/.torch ## run the calibration cities and fit confidence again, for the stock encoder
 	$(BIN)/streetfix calibrate --anew $(ARGS)

@@ -7,7 +7,7 @@ from torch import nn
 from service.scoring.comparison import PLANES
 
 #: Channels of the first block; the others have two, three and four times as many.
-WIDTH = 32
+WIDTH = 24
 _DROPOUT = 0.3
 _HIDDEN = 64
 

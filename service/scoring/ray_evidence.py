@@ -50,17 +50,19 @@ class RayEvidence:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RayWeights:
-    """Weights of two numbers of ``RayEvidence`` in the support, nats.
+    """Weights of the comparison along the rays in the support, nats per unit.
 
-    Fitted by a conditional logit over the candidates of 600 queries of five rigs in as many training cities (decision 0202).
+    Fitted by a conditional logit over the candidates of queries in training cities (decisions 0202 and 0204).
 
     Attributes:
         static_inliers: weight of the inliers without what a moved vehicle explains.
         occlusion_edges: weight of the shared depth edges of more than a metre.
+        verified: weight of the log odds of the verifier.
     """
 
     static_inliers: float = 12.0
     occlusion_edges: float = 13.0
+    verified: float = 0.6
 
 
 def ray_evidence(images: Sequence[RayImage]) -> RayEvidence:
@@ -225,18 +227,19 @@ class RayScorer:
         return found
 
     def score(self, poses: tuple[Registered, ...]) -> Scores:
-        """Return the score of each pose: inliers and shared edges with their weights. It has no details.
+        """Return the score of each pose: inliers, shared edges and the verifier with their weights. It has no details.
 
         Args:
             poses: registered poses of the reference's level frame.
         """
-        found = [self.at(pose).evidence for pose in poses]
         weights = self._weights
         return Scores(
             np.array(
                 [
-                    weights.static_inliers * each.static_inliers + weights.occlusion_edges * each.occlusion_edges
-                    for each in found
+                    weights.static_inliers * found.evidence.static_inliers
+                    + weights.occlusion_edges * found.evidence.occlusion_edges
+                    + weights.verified * found.verified
+                    for found in map(self.at, poses)
                 ],
                 np.float64,
             )

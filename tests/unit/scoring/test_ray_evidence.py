@@ -231,15 +231,17 @@ def test_frames_are_averaged(raycaster, measured, candidate):
     assert astuple(evidence_at(raycaster, (one, blind), pose)) == pytest.approx(tuple(expected))
 
 
-def test_the_scorer_weighs_two_numbers_of_the_adjusted_poses(street_map, measured, candidate):
+def test_the_scorer_weighs_three_numbers_of_the_adjusted_poses(street_map, measured, candidate):
     """The second pose is 0.3 m ahead. Its adjustment moves it to the first."""
     scorer = scorer_of(street_map, measured)
     right, ahead, beside = (
         candidate(xyz=xyz).registered for xyz in ((0.0, 0.0, 1.5), (0.3, 0.0, 1.5), (0.0, 12.0, 1.5))
     )
     values = scorer.score((right, ahead, beside)).values
-    found = [scorer.at(pose).evidence for pose in (right, ahead, beside)]
-    assert values == pytest.approx([12 * each.static_inliers + 13 * each.occlusion_edges for each in found])
+    found = [scorer.at(pose) for pose in (right, ahead, beside)]
+    assert values == pytest.approx(
+        [12 * each.evidence.static_inliers + 13 * each.evidence.occlusion_edges + 0.6 * each.verified for each in found]
+    )
     assert values[1] == pytest.approx(values[0], abs=0.5)
     assert values[2] < values[0] - 3
     np.testing.assert_allclose(scorer.at(ahead).pose.camera_m, scorer.at(right).pose.camera_m, atol=0.02)
