@@ -199,7 +199,7 @@ encoder: .venv/.torch ## train and export the stock encoder again; resumes an in
 	$(BIN)/streetfix quantize runs/mean/encoder.onnx --cities 6 --seed 3 --out model_training/stock/encoder.onnx
 
 verifier: .venv/.torch ## train the verifier again; resumes an interrupted run; fit the calibration afterwards
-	$(BIN)/streetfix train-verifier --out service/scoring/verifier.onnx $(ARGS)
+	$(BIN)/streetfix train-verifier --cities 50 --epochs 8 --out service/scoring/verifier.onnx $(ARGS)
 
 calibration: .venv/.torch ## run the calibration cities and fit confidence again, for the stock encoder
 	$(BIN)/streetfix calibrate --anew $(ARGS)

@@ -2,8 +2,8 @@
 
 Hand-made numbers of a pose (inliers, edges, steps behind surfaces) count what agrees. The network sees where it agrees: whether a
 difference has the shape of a vehicle, a tree or a house, and whether windows and markings coincide. It is trained in cities, with rigs and
-surveys, that no calibration and no evaluation uses (``model_training/verification``). Its output is one feature of the confidence, which
-calibrates it.
+surveys, that no calibration and no evaluation uses (``streetfix train-verifier``). Its output is one feature of the confidence, which
+calibrates it, and a part of the support of a pose.
 """
 
 import hashlib

@@ -118,7 +118,7 @@ def always_refined(bundle, cloud, frames, prior, settings):
 
 NO_DETAILS = {
     "structure": StructureWeights(shared_edges=0.0, upper_inliers=0.0, contrast=0.0),
-    "rays": RayWeights(static_inliers=0.0, occlusion_edges=0.0),
+    "rays": RayWeights(static_inliers=0.0, occlusion_edges=0.0, verified=0.0),
 }
 
 
