@@ -150,7 +150,7 @@ WHY_MISSED: dict[str, Reason] = {
         "halves of the image (decision 0168), a larger encoder (0174)",
     ),
     "doubt.covariance_95_coverage": Reason(
-        0.8921469497809235,
+        0.8922558922558923,
         "The worst of four figures: the position with precise depth. The full pose has 0.900 with precise and 0.902 with stereo depth "
         "(0.881 and 0.858 before decision 0179). Restarts widen the covariance along the street more often than needed, so too many "
         "errors are smaller than the lower limit. Tried before: figures of the query, the spread of nearby candidates, and factors by "
@@ -158,7 +158,7 @@ WHY_MISSED: dict[str, Reason] = {
         "0160), and a jackknife over the image (decision 0179)",
     ),
     "doubt.sigma_coverage_gap": Reason(
-        0.17881327940680813,
+        0.17928956228956228,
         "The worst case is the position along the street with precise depth. Too many errors are within one standard deviation, because "
         "the spread of restarts covers a second minimum that most answers do not have (decision 0179). With stereo depth the gap fell "
         "from 0.129 to 0.081. Tried: restarts weighted by their cost, without the farthest, and powers of their spread change the "
