@@ -46,6 +46,8 @@ def test_every_pose_is_wrong_on_the_map_of_another_city(localizer, small_dataset
 def test_poses_beside_an_answer_are_drawn_from_its_position(localizer, small_dataset):
     frame = next(iter(small_dataset.queries("drive1_precise")))
     one, same = (examples._of_query(localizer, frame, True) for _ in range(2))
+    assert one is not None
+    assert same is not None
     np.testing.assert_array_equal(one.planes, same.planes)
     np.testing.assert_array_equal(one.error_m, same.error_m)
 
@@ -58,7 +60,7 @@ class City:
 @pytest.fixture
 def recorded(monkeypatch):
     """Replace simulation, map and localizer by folders; record which city is asked on which map. City 2 has no room."""
-    asked = []
+    asked: list[tuple[object, ...]] = []
 
     def simulated(plan, out, report):
         out.mkdir(exist_ok=True)
@@ -78,8 +80,8 @@ def recorded(monkeypatch):
     monkeypatch.setattr(examples, "simulate", simulated)
     monkeypatch.setattr(examples, "build_map", mapped)
     monkeypatch.setattr(examples, "Dataset", City)
-    monkeypatch.setattr(examples.MapBundle, "open", lambda path: path.name)
-    monkeypatch.setattr(examples.Localizer, "open", lambda bundle: bundle)
+    monkeypatch.setattr(MapBundle, "open", lambda path: path.name)
+    monkeypatch.setattr(Localizer, "open", lambda bundle: bundle)
     monkeypatch.setattr(examples, "_examples", found)
     return asked
 
