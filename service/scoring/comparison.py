@@ -93,13 +93,15 @@ class FrameCells:
         return cls(pixel, in_view, np.where(in_view, (grey - grey.mean()).ravel()[pixel], np.float32(0)))
 
 
-def comparison_of(cells: FrameCells, image: RayImage, surfels: Surfels, settings: PhotometrySettings) -> Comparison:
+def comparison_of(
+    cells: FrameCells, image: RayImage, surfels: Surfels | None, settings: PhotometrySettings
+) -> Comparison:
     """Compute the planes of a comparison, each between -1 and 1; 0 where nothing is known.
 
     Args:
         cells: cells of the frame.
         image: depth of the frame and of the map along the rays of the frame's small image.
-        surfels: surfels of the map.
+        surfels: surfels of the map, whose brightness is shown; None if brightness is not compared.
         settings: settings of the brightness.
     """
     inverse, mapped_inverse = inverse_of(image.z_m), inverse_of(image.mapped_m)
@@ -111,7 +113,7 @@ def comparison_of(cells: FrameCells, image: RayImage, surfels: Surfels, settings
         np.where(seen, np.clip((z * image.climb + image.camera_m) / _HEIGHT_M, _BELOW, 1.0), 0.0)
         for z, seen in ((image.z_m, known), (image.mapped_m, hit))
     )
-    if surfels.has_brightness:
+    if surfels is not None and surfels.has_brightness:
         shown = np.nan_to_num(mapped_brightness(surfels, image.surfel_of, settings))
     else:
         shown = np.zeros(image.z_m.shape, np.float32)

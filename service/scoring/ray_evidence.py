@@ -217,8 +217,9 @@ class RayScorer:
         raycaster = self._raycasters.at(pose.camera_m)
         adjusted, scatter = adjust(raycaster, self._pictures, pose, self._settings) or (pose, None)
         images = ray_images_of(raycaster, self._measured, adjusted)
+        surfels = raycaster.cloud if self._raycasters.have_brightness else None
         comparisons = tuple(
-            comparison_of(cells, image, raycaster.cloud, self._photometry)
+            comparison_of(cells, image, surfels, self._photometry)
             for cells, image in zip(self._cells, images, strict=True)
         )
         verified = float(self._verifier.log_odds(comparisons).mean())

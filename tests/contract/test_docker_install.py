@@ -125,9 +125,11 @@ def test_what_the_service_does_not_need_is_not_there(installed: Path, tmp_path: 
 
 
 def test_no_encoder_and_no_source_of_c_is_there(installed: Path) -> None:
-    assert not [
+    """The only network is the verifier: it belongs to the program, the encoder to the map."""
+    found = [
         path for pattern in ("*.onnx", "*.c", "*.h") for path in (installed / "lib").glob(f"*/*/service/**/{pattern}")
     ]
+    assert [path.name for path in found] == ["verifier.onnx"]
     assert len(list((installed / "lib").glob("*/*/service/*/_*.so"))) == len(list((ROOT / "service").rglob("*.c")))
 
 
