@@ -171,6 +171,15 @@ def test_brightness_is_relative_to_the_image(measured_with, surfels):
     np.testing.assert_allclose(found, same, atol=0.06)
 
 
+def test_without_surfels_the_brightness_of_the_map_is_not_shown(measured_with, surfels):
+    one = measured_with()
+    shown, hidden = (planes(one, each, image_of(one, 8, 8)) for each in (surfels, None))
+    for name in PLANES:
+        if name != "mapped_brightness":
+            np.testing.assert_array_equal(shown[name], hidden[name])
+    assert (hidden["mapped_brightness"] == 0).all()
+
+
 def test_a_map_without_brightness_has_none(measured_with, street_map):
     raycaster = SurfelRaycaster(street_map, RaySettings())
     one = measured_with()
