@@ -11,6 +11,13 @@ from service.client.prepare import RequestOptions, Track
 from service.contract import schema
 from service.errors import RefusedError
 from service.geometry.camera import PinholeCamera
+from service.localization.belief import OdometryStd
+from service.option_limits import (
+    LEAST_ODOMETRY_STD_DEG,
+    LEAST_ODOMETRY_STD_M,
+    MOST_ODOMETRY_STD_DEG,
+    MOST_ODOMETRY_STD_M,
+)
 from service.retrieval.prior import Prior
 
 
@@ -20,10 +27,11 @@ class AskService:
     Args:
         client: of the service.
         map_name: name of the map; None if the service has one.
+        false_accept_rate: tolerated share of out-of-map queries that become LOCALIZED, 0 to 1; None takes that of the service.
     """
 
-    def __init__(self, client: Client, map_name: str | None = None) -> None:
-        self._client, self._map_name = client, map_name
+    def __init__(self, client: Client, map_name: str | None = None, false_accept_rate: float | None = None) -> None:
+        self._client, self._map_name, self._false_accept_rate = client, map_name, false_accept_rate
         self._before: schema.LocalizeAnswer | None = None
 
     def __call__(
@@ -54,6 +62,8 @@ class AskService:
     def _about(self, known: Known) -> RequestOptions:
         """Return the optional data of the request. An earlier service does not know all of them, so only known facts are sent."""
         about: RequestOptions = {"map": self._map_name}
+        if self._false_accept_rate is not None:
+            about["options"] = schema.Options(false_accept_rate=self._false_accept_rate)
         if known.baseline_m is not None:
             about["baseline_m"] = known.baseline_m
         if (height := known.camera_height) is not None:
@@ -69,7 +79,19 @@ class AskService:
     def _track(self, motion: Motion) -> Track:
         if self._before is None:
             return Track()
-        return Track(before=self._before, T_previous_camera=motion.T_previous_camera)
+        return Track(
+            before=self._before,
+            T_previous_camera=motion.T_previous_camera,
+            odometry_std=None if motion.std is None else _odometry_std(motion.std),
+        )
+
+
+def _odometry_std(std: OdometryStd) -> schema.OdometryStd:
+    """Convert standard deviations of odometry to the contract. A robot that stands still has none, and the contract has a least one."""
+    return schema.OdometryStd(
+        position_m=float(np.clip(std.position_m, LEAST_ODOMETRY_STD_M, MOST_ODOMETRY_STD_M)),
+        angle_deg=float(np.clip(math.degrees(std.angle_rad), LEAST_ODOMETRY_STD_DEG, MOST_ODOMETRY_STD_DEG)),
+    )
 
 
 def _prior(prior: Prior) -> schema.Prior:

@@ -80,15 +80,22 @@ def of_answer(
         counted: further names and values, such as those of ``Counts.values``.
     """
     confidence = "unknown" if answer.confidence is None else f"{answer.confidence:.3f}"
-    height, belief = answer.camera_height, answer.belief
+    height, belief, threshold = answer.camera_height, answer.belief, answer.threshold
     values = (
         ("status", answer.status),
         ("confidence", confidence),
         ("street", "none" if answer.street is None else answer.street.name),
         ("map", f"{answer.map.name}@{answer.map.version}"),
         ("camera_height", "unknown" if height is None else f"{height.height_m:.2f} m, {height.origin}"),
+        (
+            "threshold",
+            "none" if threshold is None else f"{threshold.confidence:.3f} at a rate of {threshold.false_accept_rate:g}",
+        ),
         ("calibration", answer.calibration or "unknown"),
+        ("extrapolated", ", ".join(f"{name} {size:+.1f}" for name, size in answer.extrapolated.items()) or "none"),
+        ("rig_correction", answer.rig_correction or "none"),
         ("belief", "none" if belief is None or not belief.modes else f"{belief.modes[0].weight:.3f}"),
+        ("epoch", "none" if belief is None else str(belief.epoch)),
         ("latency_ms", f"{1e3 * latency_s:.0f}"),
     )
     if why_not:

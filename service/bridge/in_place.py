@@ -14,6 +14,7 @@ from service.imaging.decode import require_sizes
 from service.imaging.depth_units import depth_from_values
 from service.localization.answer import Answer
 from service.localization.tracker import Track, follow
+from service.option_limits import FALSE_ACCEPT_RATE
 from service.retrieval.query import Query
 from service.runtime.engine import Located, expect_next
 from service.runtime.map_registry import MapRegistry
@@ -25,13 +26,15 @@ class InPlace:
 
     Args:
         bundle: folder of the map bundle.
+        false_accept_rate: tolerated share of out-of-map queries that become LOCALIZED, 0 to 1; None for the default.
 
     Raises:
         BundleError: the bundle is missing or damaged.
     """
 
-    def __init__(self, bundle: Path) -> None:
+    def __init__(self, bundle: Path, false_accept_rate: float | None = None) -> None:
         limit_pools()
+        self._false_accept_rate = false_accept_rate
         self._localizer = MapRegistry.open((bundle,)).get(None)
         self._track = Track()
 
@@ -53,7 +56,14 @@ class InPlace:
         z_m = depth_from_values(depth_m, scale_m=1.0, kind="z", camera=camera, baseline_m=None, max_range_m=None)
         require_sizes(rgb, z_m, camera)
         pair = Query.of_images(rgb, z_m, camera, baseline_m=known.baseline_m)
-        query = replace(pair, camera_height=known.camera_height, down_camera=known.down_camera, prior=known.prior)
+        query = replace(
+            pair,
+            camera_height=known.camera_height,
+            down_camera=known.down_camera,
+            prior=known.prior,
+            false_accept_rate=self._false_accept_rate or FALSE_ACCEPT_RATE,
+            rate_is_named=self._false_accept_rate is not None,
+        )
         return answer_from(Located(self._answer(query, known.motion), self._localizer.bundle))
 
     def _answer(self, query: Query, motion: Motion | None) -> Answer:
@@ -63,6 +73,6 @@ class InPlace:
             self._track = Track()
             return answer
         frame, T_previous_camera = self._localizer.encode_and_search(query), motion.T_previous_camera
-        answer, self._track = follow(self._localizer, frame, self._track, T_previous_camera)
+        answer, self._track = follow(self._localizer, frame, self._track, T_previous_camera, motion.std)
         expect_next(self._localizer.bundle, self._track, T_previous_camera)
         return answer

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from service.geometry.rigid import Transform
 from service.imaging.level import GivenHeight
+from service.localization.belief import OdometryStd
 from service.retrieval.prior import Prior
 
 
@@ -18,9 +19,11 @@ class Motion:
     Attributes:
         T_previous_camera: from the frame of this camera to that of the camera of the last answered query, metres. None: it is unknown,
             and the track begins again.
+        std: standard deviations of ``T_previous_camera``; None for the usual ones of the service.
     """
 
     T_previous_camera: Transform | None = None
+    std: OdometryStd | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

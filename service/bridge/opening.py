@@ -17,7 +17,7 @@ from service.bridge.rig import StereoRig
 from service.bridge.robot import Robot
 from service.bridge.settings import BridgeSettings
 from service.errors import RequestError
-from service.option_limits import LEAST_HEIGHT_STD_M, MOST_HEIGHT_STD_M, VEHICLE_HEIGHT_STD_M
+from service.option_limits import LEAST_FALSE_ACCEPT_RATE, LEAST_HEIGHT_STD_M, MOST_HEIGHT_STD_M, VEHICLE_HEIGHT_STD_M
 from service.runtime.wakeup import Wakeup
 
 #: Limits of a query. After a longer time the robot has left the place of the images.
@@ -85,11 +85,18 @@ def _robot(settings: BridgeSettings, rig: StereoRig) -> Robot:
             "--gravity mounting",
             field="gravity",
         )
+    noise = settings.odometry_noise
+    if not 0 <= noise <= 1:
+        raise RequestError(
+            f"--odometry-noise: {noise:g} is no share of the distance; give 0 to 1, for example 0.1, or 0 for the usual one",
+            field="odometry_noise",
+        )
     return Robot(
         rig=rig,
         rule=_rule(settings),
         gravity=settings.gravity,
         odometry=Odometry(settings.odom_topic, notices) if settings.odom_topic else None,
+        odometry_noise=noise or None,
         imu=Imu(settings.imu_topic, notices) if settings.gravity == "imu" else None,
         initial_poses=InitialPoses(settings.prior_topic, settings.frame, settings.prior_age, notices)
         if settings.prior_topic
@@ -138,6 +145,13 @@ def _rule(settings: BridgeSettings) -> MountingRule:
 @contextmanager
 def _asking(settings: BridgeSettings) -> Iterator[Localize]:
     """Provide the function that localizes: by a service, or by the map in this process."""
+    rate = settings.false_accept_rate
+    if rate and not LEAST_FALSE_ACCEPT_RATE <= rate < 1:
+        raise RequestError(
+            f"--false-accept-rate: {rate:g} is no share; give {LEAST_FALSE_ACCEPT_RATE:g} or more and less than 1, or 0 for that of the "
+            "service",
+            field="false_accept_rate",
+        )
     if settings.map is not None:
         if given := next((name for name in ("ca", "cert", "key") if getattr(settings, name) is not None), None):
             raise RequestError(
@@ -153,7 +167,7 @@ def _asking(settings: BridgeSettings) -> Iterator[Localize]:
         limit_pools_before_import()
         from service.bridge.in_place import InPlace
 
-        yield InPlace(settings.map)
+        yield InPlace(settings.map, rate or None)
         return
     from service.bridge.asking import AskService
     from service.client import Client, RetryPolicy
@@ -167,7 +181,7 @@ def _asking(settings: BridgeSettings) -> Iterator[Localize]:
         cert=settings.cert,
         key=settings.key,
     ) as client:
-        yield AskService(client, settings.map_name)
+        yield AskService(client, settings.map_name, rate or None)
 
 
 @contextmanager

@@ -17,6 +17,7 @@ from service.bridge.pose import StampedPose
 from service.bridge.rig import StereoRig
 from service.bridge.settings import GravitySource
 from service.geometry.rigid import Transform, inverse
+from service.localization.belief import std_of_motion
 
 #: Longest motion between two queries of a track, metres. A longer one is a jump of the odometry, for example to the coordinates of GNSS.
 MOST_MOTION_M = 1000.0
@@ -50,6 +51,7 @@ class Robot:
         rule: how to find the mounting of the camera.
         gravity: where the direction of gravity comes from; ``imu`` needs one.
         odometry: of the robot; None: no queries are connected to tracks.
+        odometry_noise: standard deviation of the odometry as a share of the distance and of the angle; None for the usual one.
         imu: orientation of an IMU; None if there is none.
         initial_poses: poses that become the prior; None if there are none.
         frames: fixed transforms of TF.
@@ -60,6 +62,7 @@ class Robot:
     rule: MountingRule = field(default_factory=MountingRule)
     gravity: GravitySource = "none"
     odometry: Odometry | None = None
+    odometry_noise: float | None = None
     imu: Imu | None = None
     initial_poses: InitialPoses | None = None
     frames: StaticFrames = field(default_factory=StaticFrames)
@@ -180,7 +183,10 @@ class Robot:
         if last is None or last.camera is None or last.camera.session != camera.session or last.priors != priors:
             return Motion()
         T_previous_camera = inverse(last.camera.T_odom) @ camera.T_odom
-        return Motion(T_previous_camera) if np.linalg.norm(T_previous_camera[:3, 3]) <= MOST_MOTION_M else Motion()
+        if np.linalg.norm(T_previous_camera[:3, 3]) > MOST_MOTION_M:
+            return Motion()
+        share = self.odometry_noise
+        return Motion(T_previous_camera, None if share is None else std_of_motion(T_previous_camera, share))
 
     def _body_camera(self, camera_frame: str, mounting: Mounting) -> Transform | None:
         """Return the transform from the camera frame to the body frame of the odometry; None if it is unknown."""

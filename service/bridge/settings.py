@@ -42,6 +42,7 @@ class BridgeSettings:
         gravity: see ``Robot``.
         imu_topic: see ``Topics``.
         odom_topic: see ``Topics``.
+        odometry_noise: standard deviation of the odometry as a share of the distance and of the angle; 0 for the usual one.
         prior_topic: see ``Topics``.
         prior_age: see ``InitialPoses``, seconds.
         rectified: see ``camera_from``.
@@ -49,6 +50,7 @@ class BridgeSettings:
         right_info_topic: see ``StereoRig``.
         rate: see ``PublishPolicy``, Hz.
         min_confidence: see ``PublishPolicy``.
+        false_accept_rate: tolerated share of out-of-map queries that become LOCALIZED; 0 for that of the service.
         tolerance: see ``Pairs``, seconds.
         reliable: request lost images again.
         queue: images that wait during a query.
@@ -114,6 +116,10 @@ class BridgeSettings:
         "nav_msgs/Odometry, in a frame that never jumps. The queries then form a track: more frames make an ambiguous answer certain. "
         "Empty, or no messages: each query stands alone.",
     ] = "/odom"
+    odometry_noise: Annotated[
+        float,
+        "Standard deviation of the odometry, as a share of the distance and of the angle. 0: 0.03. A robot whose feet slip needs more.",
+    ] = 0.0
     prior_topic: Annotated[
         str,
         "geometry_msgs/PoseWithCovarianceStamped of the vehicle in the frame of --frame. It is the prior of the next queries, until a "
@@ -135,6 +141,10 @@ class BridgeSettings:
     ] = None
     rate: Annotated[float, "Largest number of queries per second. 0 sends one for every pair."] = 1.0
     min_confidence: Annotated[float, "Smallest confidence of a published pose. 0 passes every LOCALIZED answer."] = 0.9
+    false_accept_rate: Annotated[
+        float,
+        "Share of out-of-map queries that may be LOCALIZED. 0: that of the service, or 0.01 with --map.",
+    ] = 0.0
     tolerance: Annotated[float, "Largest difference between the stamps of colour and depth, seconds."] = 0.02
     reliable: Annotated[
         bool, "Request lost images again. The bridge then receives nothing from best-effort publishers."

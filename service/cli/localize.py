@@ -68,6 +68,14 @@ def command(
         float | None,
         typer.Option(help="Standard deviation of the height, metres.  [default: 0.05]", show_default=False),
     ] = None,
+    false_accept_rate: Annotated[
+        float | None,
+        typer.Option(
+            help="Share of out-of-map queries that may be LOCALIZED. Up to 0.01, the answer has a confidence of at least 0.9, and above "
+            "it one of at least 0.5.  [default: that of the service]",
+            show_default=False,
+        ),
+    ] = None,
     api_key: Annotated[
         str | None,
         typer.Option(
@@ -133,7 +141,9 @@ def command(
     """
     _check_choice(rgb=rgb, depth=depth, camera=camera, sequence=sequence, batch=batch, try_focal=try_focal)
     connection = Connection(url, api_key, ca, cert, key)
-    overrides = Overrides(map_name, _prior(near, heading), camera_height, camera_height_std)
+    overrides = Overrides(
+        map_name, _prior(near, heading), camera_height, camera_height_std, false_accept_rate=false_accept_rate
+    )
     if batch is not None:
         _answer_batch(connection, batch, overrides, as_json=as_json)
         return

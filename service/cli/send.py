@@ -48,6 +48,7 @@ class Overrides:
         camera_height_m: height of the camera above the ground, metres.
         camera_height_std_m: standard deviation of the height, metres.
         focal_factor: multiplies fx and fy.
+        false_accept_rate: tolerated share of out-of-map queries that become LOCALIZED, 0 to 1.
     """
 
     map_name: str | None = None
@@ -55,6 +56,7 @@ class Overrides:
     camera_height_m: float | None = None
     camera_height_std_m: float | None = None
     focal_factor: float = 1.0
+    false_accept_rate: float | None = None
 
     def on_camera(self, request: dict[str, Any]) -> dict[str, Any]:
         """Return a request or a frame with the height and the focal length.
@@ -68,12 +70,17 @@ class Overrides:
         return request | {"camera": _with_height(_scaled(request["camera"], self.focal_factor), self)}
 
     def on_request(self, request: dict[str, Any]) -> dict[str, Any]:
-        """Return a request with the map and the prior.
+        """Return a request with the map, the prior and the false-accept rate.
 
         Args:
             request: of a single query or of a sequence.
         """
-        given = {"map": self.map_name, "prior": self.prior}
+        given: dict[str, Any] = {"map": self.map_name, "prior": self.prior}
+        options = request.get("options") or {}
+        if self.false_accept_rate is not None and isinstance(
+            options, dict
+        ):  # the service checks what a file has instead
+            given["options"] = options | {"false_accept_rate": self.false_accept_rate}
         return request | {name: value for name, value in given.items() if value is not None}
 
 

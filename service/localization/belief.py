@@ -243,12 +243,19 @@ def sighting_of(
     return Sighting(seen, known - float(each.sum()), 1.0 - known)
 
 
-def _usual_std(T_previous_camera: Transform) -> OdometryStd:
-    """Return the standard deviations of an odometry step of this size."""
-    share, least_m, angle_share, least_rad = ODOMETRY_STD
+def std_of_motion(T_previous_camera: Transform, share: float | None = None) -> OdometryStd:
+    """Return the standard deviations of an odometry step of this size.
+
+    Args:
+        T_previous_camera: odometry, from this camera's frame to the previous camera's frame, metres.
+        share: standard deviation as a share of the distance and of the angle; None takes those of ``ODOMETRY_STD``.
+    """
+    of_distance, least_m, of_angle, least_rad = ODOMETRY_STD
+    if share is not None:
+        of_distance = of_angle = share
     distance_m, angle = size_of(T_previous_camera)
     moving = min(1.0, distance_m / least_m + angle / least_rad)
-    return OdometryStd(moving * least_m + share * distance_m, moving * least_rad + angle_share * angle)
+    return OdometryStd(moving * least_m + of_distance * distance_m, moving * least_rad + of_angle * angle)
 
 
 def moved(mode: Mode, T_previous_camera: Transform, std: OdometryStd | None = None) -> Mode:
@@ -262,7 +269,7 @@ def moved(mode: Mode, T_previous_camera: Transform, std: OdometryStd | None = No
     T = nearest_rigid(mode.T_map_camera @ T_previous_camera)
     carried = covariance_at(mode.covariance, mode.T_map_camera[:3, 3], T[:3, 3])
     news = min(1.0, mode.news + _news_of(T_previous_camera))
-    std = std or _usual_std(T_previous_camera)
+    std = std or std_of_motion(T_previous_camera)
     motion = np.diag([std.position_m**2] * 3 + [std.angle_rad**2] * 3)
     return replace(mode, T_map_camera=T, covariance=carried + motion, news=news)
 

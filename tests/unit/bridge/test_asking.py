@@ -11,10 +11,12 @@ import pytest
 from service.bridge.asking import AskService
 from service.bridge.known import Known, Motion
 from service.client.prepare import Track
-from service.contract.schema import LocalizeAnswer, Prior, PriorPosition
+from service.contract.schema import LocalizeAnswer, Options, Prior, PriorPosition
 from service.errors import RefusedError, UnreachableError
 from service.geometry.camera import PinholeCamera
 from service.imaging.level import GivenHeight
+from service.localization.belief import OdometryStd
+from service.option_limits import LEAST_ODOMETRY_STD_DEG, LEAST_ODOMETRY_STD_M
 from service.retrieval import prior as core
 
 PICTURES = (np.zeros((4, 6, 3), np.uint8), np.ones((4, 6), np.float32), PinholeCamera(6, 4, 3.0, 3.0, 2.5, 1.5))
@@ -82,6 +84,34 @@ def test_a_track_carries_the_last_answer(answer_of: Callable[..., LocalizeAnswer
     befores, motions = zip(*service.tracks, strict=True)
     assert befores == (None, first, second, second)
     assert [T is not None for T in motions] == [False, True, True, False]
+
+
+@pytest.mark.parametrize(
+    ("std", "sent"),
+    [
+        (None, None),
+        (OdometryStd(0.22, math.radians(0.5)), (0.22, 0.5)),
+        (OdometryStd(0.0, 0.0), (LEAST_ODOMETRY_STD_M, LEAST_ODOMETRY_STD_DEG)),  # the robot stands still
+    ],
+)
+def test_the_noise_of_the_odometry_is_sent_within_the_contracts_bounds(
+    answer_of: Callable[..., LocalizeAnswer], std: OdometryStd | None, sent: tuple[float, float] | None
+) -> None:
+    service = Asked(answer_of(), answer_of())
+    ask = ask_of(service)
+    ask(*PICTURES, Known(motion=Motion()))
+    ask(*PICTURES, Known(motion=Motion(AHEAD, std)))
+    found = service.about[-1]["track"].odometry_std
+    assert (found is None) == (sent is None)
+    if sent is not None:
+        assert (found.position_m, found.angle_deg) == pytest.approx(sent)
+
+
+def test_a_false_accept_rate_is_sent_if_it_is_given(answer_of: Callable[..., LocalizeAnswer]) -> None:
+    service = Asked(answer_of())
+    client: Any = SimpleNamespace(localize=service.localize)
+    AskService(client, "site", 0.002)(*PICTURES, Known())
+    assert service.about == [{"map": "site", "options": Options(false_accept_rate=0.002)}]
 
 
 def test_a_query_that_stands_alone_ends_the_track(answer_of: Callable[..., LocalizeAnswer]) -> None:

@@ -51,6 +51,17 @@ def test_a_camera_height_that_is_given_counts_without_a_service_too(bundle_path:
         assert (answer.camera_height.origin, round(answer.camera_height.height_m, 1)) == (origin, 1.5)
 
 
+@pytest.mark.parametrize(("rate", "named"), [(None, (0.01, False)), (0.002, (0.002, True))])
+def test_a_false_accept_rate_counts_without_a_service_too(
+    bundle_path: Path, pictures: Any, monkeypatch: pytest.MonkeyPatch, rate: float | None, named: tuple[float, bool]
+) -> None:
+    localize = InPlace(bundle_path, rate)
+    asked = queries_of(localize, monkeypatch)
+    localize(*(*pictures, Known()))
+    (query,) = asked
+    assert (query.false_accept_rate, query.rate_is_named) == named
+
+
 def test_gravity_and_prior_reach_the_query_without_a_service_too(
     bundle_path: Path, pictures: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:

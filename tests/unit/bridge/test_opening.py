@@ -45,6 +45,7 @@ def test_every_setting_reaches_the_bridge() -> None:
         gravity="imu",
         imu_topic="/m",
         odom_topic="/o",
+        odometry_noise=0.1,
         prior_topic="/n",
         prior_age=7.0,
         rate=0.5,
@@ -64,7 +65,7 @@ def test_every_setting_reaches_the_bridge() -> None:
         np.testing.assert_array_equal(rule.mount[:3, 3], [1, 2, 3])
         assert (rule.base_frame, rule.ground_frame) == ("base", "foot")
         assert (rule.camera_height, rule.height_std_m) == (GivenHeight(0.3, 0.02), 0.02)
-        assert bridge.robot.gravity == "imu"
+        assert (bridge.robot.gravity, bridge.robot.odometry_noise) == ("imu", 0.1)
         poses = bridge.robot.initial_poses
         assert poses is not None
         assert (poses._topic, poses._frame_id, poses._most_age_s) == ("/n", "earth", 7.0)
@@ -111,6 +112,15 @@ def test_a_map_answers_without_a_service(bundle_path: Path) -> None:
         assert type(bridge.localize).__name__ == "InPlace"
 
 
+@pytest.mark.parametrize(("rate", "asked"), [(0.0, None), (0.02, 0.02)])
+def test_the_false_accept_rate_of_the_settings_is_asked_for(
+    bundle_path: Path, rate: float, asked: float | None
+) -> None:
+    for settings in (BridgeSettings(false_accept_rate=rate), BridgeSettings(false_accept_rate=rate, map=bundle_path)):
+        with opened(settings) as bridge:
+            assert bridge.localize._false_accept_rate == asked  # type: ignore[attr-defined]
+
+
 @pytest.mark.parametrize(
     ("changed", "words"),
     [
@@ -135,6 +145,8 @@ def test_a_map_answers_without_a_service(bundle_path: Path) -> None:
         ({"gravity": "moon"}, "--gravity: 'moon' is not a source of gravity; give mounting, imu or none"),
         ({"gravity": "imu", "imu_topic": ""}, "--gravity: imu needs the IMU and its mounting, but --imu-topic or"),
         ({"gravity": "imu", "tf_static_topic": ""}, "--gravity: imu needs the IMU and its mounting"),
+        ({"odometry_noise": -0.1}, "--odometry-noise: -0.1 is no share of the distance; give 0 to 1"),
+        ({"false_accept_rate": 1.0}, "--false-accept-rate: 1 is no share; give 1e-06 or more and less than 1, or 0"),
         ({"prior_age": 0.0}, "--prior-age: 0 is not a valid age; give seconds"),
         ({"base_on_ground": True, "mount": "0,0,0,0,0,0,1"}, "--mount: with --base-on-ground, its Z of 0 m"),
         ({"map": Path("m"), "map_name": "n"}, "--map gives one map"),

@@ -14,6 +14,7 @@ from service.bridge.odometry import Odometry
 from service.bridge.pose import StampedPose
 from service.bridge.robot import Facts, Robot
 from service.geometry.rigid import R_BODY_OPTICAL, Transform, rotation_y, transform_from
+from service.localization.belief import OdometryStd
 
 S, MS = 10**9, 10**6
 Make = Callable[..., Any]
@@ -60,6 +61,25 @@ def test_the_motion_is_that_of_the_camera_since_the_last_answer(odometry_of: Mak
     turned = motion_of(answered(robot, 3 * S))
     assert turned is not None
     np.testing.assert_allclose(turned, transform_from(rotation_y(-np.pi / 2), np.array([-0.5, 0.0, -0.5])), atol=1e-12)
+
+
+@pytest.mark.parametrize(("noise", "std"), [(None, None), (0.1, OdometryStd(0.02 + 0.2, float(np.deg2rad(0.2))))])
+def test_the_noise_of_the_odometry_goes_with_the_motion(
+    odometry_of: Make, noise: float | None, std: OdometryStd | None
+) -> None:
+    """A tenth of 2 m, and the 0.02 m and 0.2 degrees of any motion."""
+    robot = robot_of(odometry_noise=noise)
+    for second, x in enumerate([0.0, 2.0], start=1):
+        hear(robot, "odom", odometry_of(second * S, x, 0.0))
+    answered(robot, 1 * S)
+    motion = answered(robot, 2 * S).known.motion
+    assert motion is not None
+    assert (motion.std is None) == (std is None)
+    if motion.std is not None and std is not None:
+        assert (motion.std.position_m, motion.std.angle_rad) == (
+            pytest.approx(std.position_m),
+            pytest.approx(std.angle_rad),
+        )
 
 
 def test_a_query_without_an_answer_does_not_move_the_track(odometry_of: Make) -> None:

@@ -473,6 +473,22 @@ def test_the_camera_height_of_the_options_overrides_the_file(
     assert json.loads(posted[0]["files"]["request"][1])["camera"] == {"fx": 32} | sent
 
 
+@pytest.mark.parametrize(
+    ("in_file", "sent"),
+    [
+        ({}, {"false_accept_rate": 0.002}),
+        ({"options": {"neighbours": 3, "false_accept_rate": 0.05}}, {"neighbours": 3, "false_accept_rate": 0.002}),
+    ],
+)
+def test_a_false_accept_rate_overrides_that_of_the_file(
+    given: list[str], files: dict[str, Any], answering: Callable[..., Any], in_file: Any, sent: Any
+) -> None:
+    files["camera"].write_text(json.dumps({"camera": {"fx": 32}} | in_file))
+    posted = answering(httpx.Response(200, json=ANSWER))
+    run(*given, "--false-accept-rate", "0.002", "--no-try-focal")
+    assert json.loads(posted[0]["files"]["request"][1])["options"] == sent
+
+
 def test_a_deviation_without_a_height_is_refused(given: list[str], capsys: pytest.CaptureFixture[str]) -> None:
     assert run(*given, "--camera-height-std", "0.02") == 1
     assert "--camera-height-std: it needs a height" in capsys.readouterr().err
