@@ -15,10 +15,10 @@ from collections.abc import Callable
 from pathlib import Path
 
 from benchmarks.provenance import ROOT
-from model_training.calibration.own_rig import WRONG_RATE
+from model_training.calibration.bounds import WRONG_RATE, trials_needed
 from model_training.stock import CALIBRATION
 from service.maps.calibration import Calibration, read_calibration
-from service.option_limits import FALSE_ACCEPT_RATE, SAFE_CONFIDENCE
+from service.option_limits import FALSE_ACCEPT_RATE, LEAST_CONFIDENCE, SAFE_CONFIDENCE
 from service.scoring.support import SupportWeights
 
 REPORTS = ROOT / "reports"
@@ -41,6 +41,9 @@ def stock_calibration() -> Calibration:
 CODE: dict[str, Callable[[], float]] = {
     "false_accept_rate": lambda: FALSE_ACCEPT_RATE,
     "safe_confidence": lambda: SAFE_CONFIDENCE,
+    "least_confidence": lambda: LEAST_CONFIDENCE,
+    "trials_for_wrong_rate": lambda: float(trials_needed(WRONG_RATE)),
+    "localized_from_confidence_at_0_02": lambda: stock_calibration().threshold(0.02),
     "wrong_rate": lambda: WRONG_RATE,
     "structure_gap": lambda: SupportWeights().structure_gap,
     "rays_most": lambda: SupportWeights().rays_most,

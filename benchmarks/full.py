@@ -9,7 +9,7 @@ from benchmarks.coverage import COVERAGE_BAR, SIGMA_GAP_BAR, consistent, sigma_g
 from benchmarks.plans import BOTH, more_plan, paper_plan, unseen_plan
 from benchmarks.report import Report
 from benchmarks.runs import Runs, share
-from model_training.calibration.own_rig import WRONG_RATE
+from model_training.calibration.bounds import WRONG_RATE
 from model_training.evaluation.error_measures import distance_errors, heading_errors_deg
 from model_training.evaluation.measures import measure
 from model_training.evaluation.pose_errors import pose_errors

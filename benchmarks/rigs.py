@@ -13,11 +13,11 @@ from benchmarks.coverage import Coverage, coverage_rows, worst_coverage_rows
 from benchmarks.provenance import Run, commit_with_code, git, machine
 from benchmarks.report import Report
 from model_training.calibration.answer_code import code_of_answers
+from model_training.calibration.bounds import WRONG_RATE
 from model_training.calibration.cross_check import FamilyFigures, cross_check, cross_check_groups
 from model_training.calibration.families import NOT_FITTED, related
 from model_training.calibration.fit import CalibrationData
 from model_training.calibration.make import codes_of_answers, collected
-from model_training.calibration.own_rig import WRONG_RATE
 from model_training.cli.progress import bars
 
 #: Queries on the street with repeating blocks. It is a kind of street, not of rig, and half of its places cannot be told apart.

@@ -6,6 +6,8 @@ NEIGHBOURS, MOST_NEIGHBOURS = 5, 50
 FALSE_ACCEPT_RATE = 0.01
 #: Least confidence of a LOCALIZED answer at the default rate, and at lower ones. A higher rate accepts more answers.
 SAFE_CONFIDENCE = 0.9
+#: Least confidence of a LOCALIZED answer at any rate: a pose that is more likely wrong than right is no answer.
+LEAST_CONFIDENCE = 0.5
 #: Lower limit of the option ``false_accept_rate``. No calibration could measure a lower rate.
 LEAST_FALSE_ACCEPT_RATE = 1e-6
 #: Shortest side of an image, pixels, and largest ratio of its sides. The longer side determines the memory of an answer.

@@ -12,6 +12,8 @@ from service.option_limits import FALSE_ACCEPT_RATE, SAFE_CONFIDENCE
 
 #: Certainty of an upper bound, one-sided.
 SURE = 0.95
+#: Share of wrong answers among accepted answers that the default aims at, and that a robot's owner usually requires.
+WRONG_RATE = 0.01
 
 
 def upper_bounds(events: NDArray[np.float64], trials: float) -> NDArray[np.float64]:

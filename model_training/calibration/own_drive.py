@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from model_training.calibration.elsewhere import is_outside, without_surroundings
+from model_training.calibration.labelled_frames import LabelledFrames, blocks_of, frames_of, joined_frames
 from model_training.calibration.odometry_labels import LABEL_NOISE, MARGIN, Labels, labels_by_odometry
-from model_training.calibration.own_rig import LabelledFrames, blocks_of, frames_of, joined_frames
 from model_training.datasets.dataset import ODOMETRY_FILE, Dataset, QueryFrame, query_folder
 from model_training.evaluation.predict import in_order
 from service.errors import DatasetError, NoDepthError

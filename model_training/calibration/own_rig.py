@@ -11,10 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import minimize
 
-from model_training.calibration.bounds import bounded_thresholds, trials_needed, upper_bound
+from model_training.calibration.bounds import WRONG_RATE, bounded_thresholds, trials_needed, upper_bound
 from model_training.calibration.fit import RATES
-from service.confidence.decision import is_acceptable
-from service.confidence.features import FEATURES
+from model_training.calibration.labelled_frames import LabelledFrames
+from model_training.calibration.own_range import acceptable, is_supported, ranges_of
 from service.errors import DatasetError
 from service.maps.calibration import UNNAMED, Calibration, RigCorrection, corrected_log_odds, probability
 from service.maps.rig_key import RigKey
@@ -27,50 +27,8 @@ PRIOR_OFFSET_NATS, PRIOR_SCALE = 1.0, 0.25
 LEAST_SCALE = 0.2
 #: Scales and offsets from which the search for the best correction starts.
 _SCALES, _OFFSETS = (0.2, 0.35, 0.5, 0.75, 1.0, 1.5), (-4.0, -2.0, -1.0, -0.5, 0.0, 0.5, 1.0, 2.0)
-#: Number of blocks of the cross-validation.
-BLOCKS = 5
-#: Share of wrong answers among accepted answers that the default aims at, and that a robot's owner usually requires. The report states
-#: whether the frames support it.
-WRONG_RATE = 0.01
 #: Frames in a bin of the calibration error, at least, and the largest number of bins.
 _BIN_FRAMES, _BINS = 20, 15
-
-
-@dataclass(frozen=True, eq=False)
-class LabelledFrames:
-    """Answers to frames of one rig, with their labels. Frames without confidence features are left out.
-
-    Attributes:
-        evidence: confidence features in the order of ``FEATURES`` (n, F).
-        right: whether the position of the answer is right (n,). Out-of-map frames are never right.
-        outside: whether the frame is an out-of-map frame (n,).
-        block: number of the block of consecutive frames for the cross-validation (n,).
-    """
-
-    evidence: NDArray[np.float64]
-    right: NDArray[np.bool_]
-    outside: NDArray[np.bool_]
-    block: NDArray[np.int64]
-
-    def __len__(self) -> int:
-        return len(self.right)
-
-    def where(self, keep: NDArray[np.bool_]) -> "LabelledFrames":
-        """Return some of the frames.
-
-        Args:
-            keep: whether to keep each frame (n,).
-        """
-        return LabelledFrames(*(getattr(self, name)[keep] for name in LabelledFrames.__dataclass_fields__))
-
-
-def blocks_of(count: int) -> NDArray[np.int64]:
-    """Return the block of each of some consecutive frames: ``BLOCKS`` blocks of equal length (n,).
-
-    Args:
-        count: number of frames.
-    """
-    return np.arange(count, dtype=np.int64) * BLOCKS // max(1, count)
 
 
 def learn_correction(
@@ -93,6 +51,8 @@ def learn_correction(
     Thresholds come from all out-of-map frames and their confidence with the correction. The correction was fitted on the same frames, but
     it keeps the order of answers. So the thresholds accept the same answers as thresholds of the confidence without it, which has not seen
     the frames. The bound holds.
+
+    If the frames of a recording support it, the correction widens the range of the calibration data for its rig (``own_range``).
 
     Args:
         calibration: calibration of the map. Its corrections for rigs do not count.
@@ -149,14 +109,26 @@ def learn_correction(
         rates = sorted({*RATES, false_accept_rate})
         thresholds = bounded_thresholds(np.asarray(confidence), np.full(count, 1.0 / count), rates)
         correction = correction.model_copy(update={"thresholds": thresholds})
-    level = stock.model_copy(update={"rig": correction}).threshold(FALSE_ACCEPT_RATE)
-    acceptable = [is_acceptable(stock, row, FALSE_ACCEPT_RATE) for row in frames.evidence]
-    return _with_counts(correction, frames, (after >= level) & np.array(acceptable))
+    in_range = _with_counts(stock, correction, frames, after)
+    if source == "rendered" or not (ranges := ranges_of(stock, frames)):
+        return in_range
+    widened = _with_counts(stock, correction.model_copy(update={"ranges": ranges}), frames, after)
+    return widened if is_supported(in_range, widened) else in_range
 
 
-def _with_counts(correction: RigCorrection, frames: LabelledFrames, accepted: NDArray[np.bool_]) -> RigCorrection:
-    """Return the correction with the numbers of accepted frames and the bounds of their shares."""
-    inside = ~frames.outside
+def _with_counts(
+    stock: Calibration, correction: RigCorrection, frames: LabelledFrames, confidence: NDArray[np.float64]
+) -> RigCorrection:
+    """Return the correction with the numbers of frames that are accepted at the default rate, and the bounds of their shares.
+
+    Args:
+        stock: calibration without corrections for rigs.
+        correction: the correction; its thresholds and ranges count.
+        frames: the labelled frames.
+        confidence: confidence of each frame, by corrections that were fitted on other frames (n,).
+    """
+    corrected, inside = stock.model_copy(update={"rig": correction}), ~frames.outside
+    accepted = (confidence >= corrected.threshold(FALSE_ACCEPT_RATE)) & acceptable(corrected, frames)
     counts = [int(each.sum()) for each in (accepted & inside, accepted & inside & ~frames.right, accepted & ~inside)]
     return correction.model_copy(
         update={
@@ -412,37 +384,6 @@ def replaced_by(calibration: Calibration, correction: RigCorrection) -> tuple[Ri
         for each in calibration.rigs
         if key is not None and each.made_for is not None and key.is_same(each.made_for)
     )
-
-
-def joined_frames(parts: list[LabelledFrames]) -> LabelledFrames:
-    """Join labelled frames. Frames of different parts share blocks of the same number.
-
-    Args:
-        parts: the frames to join.
-    """
-    names = LabelledFrames.__dataclass_fields__
-    return LabelledFrames(*(np.concatenate([getattr(part, name) for part in parts]) for name in names))
-
-
-def frames_of(
-    evidence: list[NDArray[np.float64] | None],
-    right: NDArray[np.bool_],
-    outside: NDArray[np.bool_],
-    block: NDArray[np.int64],
-) -> LabelledFrames:
-    """Return the labelled frames of some answers. Answers without confidence features are left out.
-
-    Args:
-        evidence: confidence features of each answer; None without registration (n).
-        right: labels (n,).
-        outside: whether each frame is an out-of-map frame (n,).
-        block: block of each frame (n,).
-    """
-    keep = np.array([each is not None for each in evidence], bool)
-    rows = np.array([each for each in evidence if each is not None]).reshape(-1, len(FEATURES))
-    found = LabelledFrames(rows, right[keep] & ~outside[keep], outside[keep], block[keep])
-    finite = np.isfinite(rows).all(axis=1)
-    return found if finite.all() else found.where(finite)
 
 
 def _cross_validated(

@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from model_training.calibration.elsewhere import without_surroundings
+from model_training.calibration.labelled_frames import LabelledFrames, blocks_of, frames_of, joined_frames
 from model_training.calibration.out_of_map import Box
-from model_training.calibration.own_rig import LabelledFrames, blocks_of, frames_of, joined_frames
 from model_training.datasets.files import read_bytes
 from model_training.evaluation.predict import in_order
 from model_training.mapping.rendered_query import grey_image, noisy_depth
@@ -175,6 +175,14 @@ class RigFile(_Frozen):
         return noisy_depth(depth_m, noise, group, int(group.max(initial=0)) + 1, rng, largest_m=d.max_range_m)
 
 
+#: What to do about fields that a request has, and a rig whose images are rendered cannot have.
+_REMEDIES = {
+    "rectified": "; rectify the images first",
+    "camera.distortion": "; leave it out, and give the rectified camera that `streetfix doctor` prints",
+    "gravity": "; leave it out, because the rendered camera is nearly level",
+}
+
+
 def read_rig(path: Path) -> RigFile:
     """Read ``rig.json``.
 
@@ -189,7 +197,7 @@ def read_rig(path: Path) -> RigFile:
     except ValidationError as error:
         first = error.errors(include_url=False, include_input=False)[0]
         where = ".".join(str(part) for part in first["loc"]) or "rig.json"
-        remedy = "; rectify the images first" if where == "rectified" else ""
+        remedy = _REMEDIES.get(where, "")
         what = first["msg"].removeprefix("Value error, ")
         raise DatasetError(f"{path}: {where}: {what}{remedy}; docs/formats.md has an example", field=where) from error
 

@@ -12,6 +12,7 @@ from rich.console import Console
 
 from model_training.calibration.make import calibrate
 from model_training.calibration.own_drive import MOST_ELSEWHERE, frames_of_drive, images_of_drive
+from model_training.calibration.own_range import range_lines
 from model_training.calibration.own_rig import (
     learn_correction,
     replaced_by,
@@ -252,9 +253,10 @@ def _calibrate_rig(folder: Path, source: Dataset | RigFile, given: _OfDrive, out
         ):
             if count:
                 console.print(f"left out: {count} images {what}")
+        frames = found.frames
         correction = learn_correction(
             calibration,
-            found.frames,
+            frames,
             source="drive",
             measured_on=found.described,
             name=found.name,
@@ -262,7 +264,7 @@ def _calibrate_rig(folder: Path, source: Dataset | RigFile, given: _OfDrive, out
             label_noise=found.label_noise,
             false_accept_rate=rate,
         )
-    for line in report_lines(correction):
+    for line in (*report_lines(correction), *range_lines(calibration, correction, frames)):
         console.print(line)
     for line in _change_lines(calibration, correction):
         console.print(line)
@@ -290,11 +292,11 @@ def _change_lines(calibration: Calibration, correction: RigCorrection) -> list[s
 
 
 def part_for(opened: Map, source: Dataset | RigFile, queries: Sequence[str] = ()) -> Map:
-    """Return the part of a map that calibrates a rig: all of it, or of a tiled map the tiles of the recording.
+    """Return the part of a map that calibrates a rig: all of it, or of a tiled map at most ``MOST_AROUND`` tiles.
 
     Args:
         opened: the map.
-        source: the recording, or the rig whose images are rendered from the first tile.
+        source: the recording, or the rig whose images are rendered from tiles that are spread over the map.
         queries: names of the query sets of the recording; empty for all.
 
     Raises:
@@ -303,7 +305,8 @@ def part_for(opened: Map, source: Dataset | RigFile, queries: Sequence[str] = ()
     if not isinstance(opened, TiledMap):
         return opened
     if isinstance(source, RigFile):
-        return opened.around(lambda: np.array(opened.T_map_place[:1, :3, 3]))
+        spread = np.linspace(0, len(opened.T_map_place) - 1, MOST_AROUND).round().astype(int)
+        return opened.around(lambda: np.array(opened.T_map_place[spread, :3, 3]))
     names = [name for name in source.query_sets(with_truth=True) if not queries or name in queries]
     frames = [frame for name in names for frame in source.queries(name)]
     positions = [frame.T_map_camera[:3, 3] for frame in frames if frame.T_map_camera is not None]

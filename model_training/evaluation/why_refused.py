@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from model_training.datasets.dataset import QueryFrame
 from model_training.evaluation.predict import Predictions
+from service.confidence.decision import calibration_for
 from service.confidence.features import FEATURES
 from service.confidence.reasons import FOCAL_FACTORS, GAIN, reasons_of, support_of
 from service.errors import NoDepthError
@@ -65,7 +66,7 @@ def causes(localizer: Localizer, frames: Sequence[QueryFrame], answers: Predicti
     found = _tried(localizer, queries)
     if not is_few:
         return found
-    calibration = localizer.bundle.calibration
+    calibration = calibration_for(localizer.bundle.calibration, queries)
     return found if calibration is None else [*found, *out_of_range(calibration, answers.evidence)]
 
 

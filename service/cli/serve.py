@@ -104,7 +104,7 @@ def command(
         float | None,
         typer.Option(
             help="Largest share of the out-of-map calibration queries that may be LOCALIZED. A higher rate than the default also accepts "
-            "a confidence below 0.9.  [default: 0.01]"
+            "a confidence of 0.5 to 0.9.  [default: 0.01]"
         ),
     ] = None,
 ) -> None:

@@ -8,7 +8,8 @@ import numpy as np
 from jaxtyping import Float64
 from numpy.typing import NDArray
 
-from service.confidence.features import FEATURES, IDEALS
+from service.confidence.features import FEATURES
+from service.confidence.fitted_range import extrapolated
 from service.confidence.reasons import Reason, reasons_of
 from service.confidence.spread import Extent, Spread, spread_of
 from service.errors import RequestError
@@ -25,8 +26,6 @@ KNOWN = 0.5
 #: The best candidate of an accepted answer must hold more than half of the support of all distinct candidates. The threshold on
 #: confidence rejects out-of-map queries. It does not reject perceptual aliases, such as six blocks that look the same (decision 0086).
 _SHARE, _HALF = FEATURES.index("log_share"), float(np.log(0.5))
-#: Width of the margin beyond the knots of a term, as a share of the distance between the first and the last.
-MARGIN = 0.1
 
 
 @dataclass(frozen=True, slots=True)
@@ -101,17 +100,30 @@ def is_acceptable(
 ) -> bool:
     """Return whether an answer may be LOCALIZED, whatever its confidence.
 
-    The best candidate needs the majority of the support. At the default false-accept rate and below, the evidence must lie in the range of
-    the calibration data. On a depth camera of 5 m, two thirds of the answers outside of it with a confidence above 0.9 were wrong
-    (decision 0149).
+    The best candidate needs the majority of the support, and the evidence must be in range (``is_in_range``).
 
     Args:
-        calibration: calibration of the map.
+        calibration: calibration for the query, with the correction for its rig.
         evidence: confidence features of the answer.
         false_accept_rate: largest tolerated share of out-of-map queries that become LOCALIZED, 0 to 1.
     """
-    supported = false_accept_rate > FALSE_ACCEPT_RATE or not extrapolated(calibration, evidence)
-    return supported and bool(evidence[_SHARE] > _HALF)
+    return is_in_range(calibration, evidence, false_accept_rate) and bool(evidence[_SHARE] > _HALF)
+
+
+def is_in_range(
+    calibration: Calibration, evidence: Float64[NDArray[np.float64], " F"] | None, false_accept_rate: float
+) -> bool:
+    """Return whether the calibration data support the evidence, as far as the false-accept rate requires it.
+
+    At the default false-accept rate and below, the evidence must lie in the range of the calibration data. On a depth camera of 5 m, two
+    thirds of the answers outside of it with a confidence above 0.9 were wrong (decision 0149).
+
+    Args:
+        calibration: calibration for the query, with the correction for its rig.
+        evidence: confidence features of an answer; None without registration.
+        false_accept_rate: largest tolerated share of out-of-map queries that become LOCALIZED, 0 to 1.
+    """
+    return false_accept_rate > FALSE_ACCEPT_RATE or not extrapolated(calibration, evidence)
 
 
 def share_of(evidence: Float64[NDArray[np.float64], " F"]) -> float:
@@ -135,7 +147,7 @@ class Outcome:
         candidates: registered poses, the best supported first; None if nothing was registered. If the answer is not LOCALIZED,
             candidates that exclude each other have covariances.
         spread: mean and covariance over all places where the camera may be; None for a LOCALIZED answer.
-        extrapolated: confidence features outside the range of the calibration data, as from ``extrapolation.extrapolated``.
+        extrapolated: confidence features outside the range of the calibration data, as from ``fitted_range.extrapolated``.
         threshold: the threshold that decided, with its false-accept rate; None if ``confidence`` is None.
         rig_correction: name of the correction for a rig that the confidence has; None without one.
     """
@@ -249,34 +261,3 @@ def _spread_over(candidates: tuple[Candidate, ...], frames: int, confidence: flo
         confidence=confidence,
         extent=extent,
     )
-
-
-def extrapolated(
-    calibration: Calibration, evidence: Float64[NDArray[np.float64], " F"] | None
-) -> tuple[tuple[str, float], ...]:
-    """Return the features that the confidence uses and that lie outside the range of the calibration data.
-
-    The confidence does not follow a feature beyond the first and the last knot of its term. The range is wider by ``MARGIN`` of the
-    distance between the knots, because a few of the calibration's own queries lie just outside. Some features have an
-    ideal value, for example 0 m. On that side the range has no limit: the answer gets no more credit than the best calibration data.
-
-    Args:
-        calibration: calibration of the map.
-        evidence: confidence features of an answer; None without registration, then the result is empty.
-
-    Returns:
-        Name, and signed distance from the mean of the calibration data in standard deviations, the farthest first.
-    """
-    if evidence is None:
-        return ()
-    away = calibration.deviations(evidence)
-    outside = []
-    for term in calibration.right.terms:
-        column = calibration.names.index(term.feature)
-        margin = MARGIN * (term.knots[-1] - term.knots[0])
-        ideal = IDEALS.get(term.feature, 0)
-        below = ideal >= 0 and evidence[column] < term.knots[0] - margin
-        above = ideal <= 0 and evidence[column] > term.knots[-1] + margin
-        if below or above:
-            outside.append((term.feature, float(away[column])))
-    return tuple(sorted(outside, key=lambda each: (-abs(each[1]), each[0])))

@@ -7,11 +7,13 @@ from jaxtyping import Float32, Float64
 from numpy.typing import NDArray
 
 from service.confidence.features import FEATURES, IDEALS
+from service.confidence.fitted_range import extrapolated
 from service.imaging.depth_unit_hint import unit_hint
 from service.maps.calibration import Calibration
 from service.scoring.support import SupportWeights
 
-#: A confidence feature is out of range if it is more than this many standard deviations from the mean of the calibration data.
+#: A confidence feature is a reason if it is more than this many standard deviations from the mean of the calibration data. So is each
+#: feature outside the range of the calibration data, because it alone prevents LOCALIZED.
 FAR = 3.0
 #: Factors of the focal length to try. A common error is to send the intrinsics of an image of half or twice the size.
 FOCAL_FACTORS = (0.5, 2.0)
@@ -28,8 +30,8 @@ class Reason:
 
     Attributes:
         check: what may be wrong, for example ``baseline``.
-        evidence: confidence features out of range, each with its signed distance from the mean of the calibration data, in
-            standard deviations.
+        evidence: confidence features that are far from the calibration data, each with its signed distance from their mean, in standard
+            deviations.
         remedy: what to do.
     """
 
@@ -71,7 +73,7 @@ def reasons_of(
     evidence: Float64[NDArray[np.float64], " F"] | None,
     depth_m: Float32[NDArray[np.float32], "h w"] | None = None,
 ) -> tuple[Reason, ...]:
-    """List what to check, the likeliest cause first; empty if all confidence features are in range and the depth is plausible.
+    """List what to check, the likeliest cause first; empty if no confidence feature is unusual and the depth is plausible.
 
     A feature that is better than the calibration data is no reason, for example an unusually large share of inliers.
 
@@ -90,11 +92,15 @@ def reasons_of(
 def _by_evidence(calibration: Calibration, evidence: Float64[NDArray[np.float64], " F"] | None) -> tuple[Reason, ...]:
     if evidence is None:
         return (_TOO_LITTLE,)
-    away = calibration.deviations(evidence)
+    away, outside = calibration.deviations(evidence), dict(extrapolated(calibration, evidence))
     found = []
     for check, names, remedy in GROUPS:
         deviations = ((name, float(away[FEATURES.index(name)])) for name in names)
-        far = tuple((name, size) for name, size in deviations if abs(size) > FAR and size * IDEALS.get(name, 0) <= 0)
+        far = tuple(
+            (name, size)
+            for name, size in deviations
+            if name in outside or (abs(size) > FAR and size * IDEALS.get(name, 0) <= 0)
+        )
         if far:
             found.append(Reason(check, far, remedy))
     return tuple(found)

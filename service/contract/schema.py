@@ -278,7 +278,8 @@ class Options(_Strict):
         ge=LEAST_FALSE_ACCEPT_RATE,
         lt=1,
         description="tolerated share of out-of-map queries with status LOCALIZED. The service refuses a rate below the lowest "
-        "rate that the map's calibration supports, or that the recording of this rig supports. Default: the service's setting",
+        "rate that the map's calibration supports, or that the recording of this rig supports. Up to 0.01, a LOCALIZED answer has a "
+        "confidence of at least 0.9, and at any rate one of at least 0.5. Default: the service's setting",
     )
 
 

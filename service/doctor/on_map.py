@@ -16,6 +16,8 @@ from service.runtime.engine import query_in
 
 #: Share of the camera's rows that the LiDAR must see.
 LEAST_OVERLAP = 0.5
+#: What helps if the evidence of an answer lies outside the range of the calibration data.
+OWN_RECORDING = "calibrate the map on a recording of this rig (streetfix calibrate --map --drive)"
 
 
 def rows_of_camera(pair: Pair, bundle: Map) -> Bool[NDArray[np.bool_], " rows"]:
@@ -104,19 +106,20 @@ def check_answer(pair: Pair, localizer: Localizer, false_accept_rate: float) -> 
     confidence = "no confidence" if answer.confidence is None else f"confidence {answer.confidence:.3f}"
     rig = "" if answer.rig_correction is None else f", with the correction for {answer.rig_correction}"
     text = f"{answer.status} ({confidence}{rig})"
+    if answer.extrapolated:
+        outside = ", ".join(f"{name} {size:+.1f}" for name, size in answer.extrapolated)
+        text += f", extrapolated: {outside} standard deviations from the mean of the calibration data"
     if answer.status == "LOCALIZED":
         if answer.extrapolated:
-            outside = ", ".join(f"{name} {size:+.1f}" for name, size in answer.extrapolated)
-            return Finding(
-                "answer",
-                "warning",
-                f"{text}, extrapolated: {outside} standard deviations from the mean of the calibration data",
-                "the confidence may be wrong; calibrate the map on queries like this one (streetfix calibrate)",
-            )
+            return Finding("answer", "warning", text, f"the confidence may be wrong; {OWN_RECORDING}")
         return Finding("answer", "ok", text)
     reasons = "; ".join(f"{each.check}: {each.remedy}" for each in answer.reasons)
-    remedy = (
-        reasons
-        or "all confidence features are in the range of the calibration data; the place may be outside the map, or look like another place"
+    if answer.extrapolated:
+        return Finding("answer", "warning", text, f"{reasons}; or {OWN_RECORDING}" if reasons else OWN_RECORDING)
+    in_range = "all confidence features are in the range of the calibration data"
+    return Finding(
+        "answer",
+        "warning",
+        text,
+        reasons or f"{in_range}; the place may be outside the map, or look like another place",
     )
-    return Finding("answer", "warning", text, remedy)

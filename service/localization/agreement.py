@@ -7,12 +7,11 @@ import numpy as np
 from jaxtyping import Float64
 from numpy.typing import NDArray
 
-from service.confidence.decision import Decision, calibration_for, decision_of, extrapolated, is_acceptable, share_of
+from service.confidence.decision import Decision, calibration_for, decision_of, is_acceptable, is_in_range, share_of
 from service.geometry.rigid import Transform, inverse, nearest_rigid
 from service.localization.belief import Belief, FrameCandidate, agrees, sighting_of
 from service.localization.compose import QueryResult
 from service.maps.calibration import Calibration
-from service.option_limits import FALSE_ACCEPT_RATE
 from service.retrieval.retrieve import EncodedFrame
 from service.scoring.candidates import Candidate, distinct_candidates, shares_of
 from service.timing import stage
@@ -103,7 +102,7 @@ def updated_belief(calibration: Calibration | None, frame: EncodedFrame, alone: 
     decision, calibration = alone.decision, calibration_for(calibration, (frame.query,))
     if alone.refined is None or calibration is None or decision is None:
         return belief.unseen()
-    if frame.query.false_accept_rate <= FALSE_ACCEPT_RATE and extrapolated(calibration, alone.evidence):
+    if not is_in_range(calibration, alone.evidence, frame.query.false_accept_rate):
         return belief.unseen()
     if belief.born and frame.query.prior is not None:  # a prior counts once, in the first frame of a track
         decision = decision_of(calibration, replace(frame.query, prior=None), alone.refined, alone.evidence)

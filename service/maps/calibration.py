@@ -19,6 +19,7 @@ from pydantic import (
 
 from service.errors import BundleError
 from service.maps.rig_key import RigKey
+from service.option_limits import LEAST_CONFIDENCE
 
 #: Name of a correction for a rig in a map of an earlier release.
 UNNAMED = "unnamed"
@@ -109,6 +110,26 @@ class Threshold(_Frozen):
     confidence: float = Field(ge=0, le=1)
 
 
+class FeatureRange(_Frozen):
+    """Range of a confidence feature in the frames of a recording, in the feature's unit.
+
+    Attributes:
+        feature: name of the feature.
+        least: smallest value.
+        most: largest value.
+    """
+
+    feature: str
+    least: float
+    most: float
+
+    @model_validator(mode="after")
+    def _ordered(self) -> "FeatureRange":
+        if self.least > self.most:
+            raise ValueError(f"{self.feature}: least is larger than most")
+        return self
+
+
 class Site(_Frozen):
     """Correction of the confidence from queries that are rendered from this map's own survey (decision 0030).
 
@@ -156,6 +177,8 @@ class RigCorrection(_Frozen):
         outside_share_upper: upper bound (95 %, Clopper-Pearson) of the share of accepted out-of-map frames.
         thresholds: thresholds from the out-of-map frames, sorted by rising false-accept rate. They hold for this rig instead of those of
             the map. Empty: those of the map hold.
+        ranges: ranges of features that widen the range of the calibration data for this rig, if the recording supports it. Empty: an
+            answer outside the range of the calibration data stays ``extrapolated``.
     """
 
     name: str = Field(UNNAMED, min_length=1)
@@ -176,6 +199,7 @@ class RigCorrection(_Frozen):
     outside_accepted: int = Field(ge=0)
     outside_share_upper: float = Field(ge=0, le=1)
     thresholds: tuple[Threshold, ...] = ()
+    ranges: tuple[FeatureRange, ...] = ()
 
     @model_validator(mode="after")
     def _consistent(self) -> "RigCorrection":
@@ -186,7 +210,7 @@ class RigCorrection(_Frozen):
     def _without_new_fields(self, serialize: Callable[[Any], dict[str, Any]]) -> dict[str, Any]:
         """Leave out what a map of an earlier release does not have, so that its file keeps its bytes and its hash."""
         content = serialize(self)
-        nothing = {"name": UNNAMED, "made_for": None, "thresholds": ()}
+        nothing = {"name": UNNAMED, "made_for": None, "thresholds": (), "ranges": ()}
         return {
             name: value
             for name, value in content.items()
@@ -333,19 +357,19 @@ class Calibration(_Frozen):
     def threshold_at(self, false_accept_rate: float) -> Threshold:
         """Return the threshold for a given false-accept rate: that of the highest measured rate that does not exceed it.
 
-        The thresholds of ``rig`` replace those of the map. At a rate that they do not support, the stricter of both applies.
+        The thresholds of ``rig`` replace those of the map. At a rate that they do not support, the stricter of both applies. The
+        confidence is at least ``LEAST_CONFIDENCE``, whatever the rate.
 
         Args:
             false_accept_rate: tolerated share of accepted out-of-map queries. Below the lowest measured rate the threshold of that rate
                 applies.
         """
-        of_map = _threshold_among(self.thresholds, false_accept_rate)
-        if self.rig is None or not self.rig.thresholds:
-            return of_map
-        of_rig = _threshold_among(self.rig.thresholds, false_accept_rate)
-        if of_rig.false_accept_rate <= false_accept_rate:
-            return of_rig
-        return max(of_rig, of_map, key=lambda each: each.confidence)
+        found = _threshold_among(self.thresholds, false_accept_rate)
+        if self.rig is not None and self.rig.thresholds:
+            of_rig = _threshold_among(self.rig.thresholds, false_accept_rate)
+            is_supported = of_rig.false_accept_rate <= false_accept_rate
+            found = of_rig if is_supported else max(of_rig, found, key=lambda each: each.confidence)
+        return found.model_copy(update={"confidence": max(found.confidence, LEAST_CONFIDENCE)})
 
     def threshold(self, false_accept_rate: float) -> float:
         """Return the least confidence of an accepted answer for a given false-accept rate, as in ``threshold_at``.

@@ -209,7 +209,7 @@ class Settings(BaseSettings):
         ge=LEAST_FALSE_ACCEPT_RATE,
         lt=1,
         description="largest share of the out-of-map calibration queries that may be LOCALIZED. A higher rate than the default also "
-        "accepts a confidence below 0.9",
+        "accepts a confidence of 0.5 to 0.9",
     )
     belief_key: SecretStr | None = Field(
         None,

@@ -4,15 +4,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from model_training.calibration.bounds import bounded_thresholds, upper_bound
+from model_training.calibration.labelled_frames import BLOCKS, LabelledFrames, blocks_of, frames_of, joined_frames
 from model_training.calibration.own_rig import (
-    BLOCKS,
     LEAST_SCALE,
-    LabelledFrames,
-    blocks_of,
     calibration_error,
     fit_correction,
-    frames_of,
-    joined_frames,
     learn_correction,
     log_odds_of,
     replaced_by,

@@ -12,7 +12,7 @@ from service.geometry.rigid import R_BODY_OPTICAL, rotation_z, transform_from
 from service.localization.localizer import Localizer
 from service.maps.reader import MapBundle
 from service.maps.tiled_writer import write_tiled
-from service.maps.tiles import open_map
+from service.maps.tiles import MOST_AROUND, open_map
 from service.maps.writer import replace_calibration
 
 CAMERA = {"width": 64, "height": 48, "fx": 32.0, "fy": 32.0, "cx": 31.5, "cy": 23.5, "height_m": 1.5}
@@ -55,6 +55,12 @@ def test_a_rig_file_is_read(tmp_path):
         ({"depth": STEREO | {"min_range_m": 40}}, "depth", "min_range_m 40 is not below max_range_m 30"),
         ({"depth": {"min_range_m": 1, "max_range_m": 9}}, "depth", "a sensor without errors does not exist"),
         ({"rectified": False}, "rectified", "rectify the images first"),
+        (
+            {"camera": CAMERA | {"distortion": {"k1": 0.1}}},
+            "camera.distortion",
+            "rectified camera that `streetfix doctor` prints",
+        ),
+        ({"gravity": [0, 1, 0]}, "gravity", "the rendered camera is nearly level"),
         ({"depth": STEREO | {"noise_px": float("nan")}}, "depth.noise_px", "finite number"),
     ],
 )
@@ -205,3 +211,16 @@ def test_a_tiled_map_is_calibrated_on_its_own_tiles(stock_map, small_dataset, tm
     frame = next(iter(small_dataset.queries("drive1_precise")))
     assert Localizer.open(again).localize(frame.query(again.grid)).candidates
     assert part_for(again, small_dataset).T_map_place.shape == again.T_map_place.shape
+
+
+def test_the_images_of_a_tiled_map_come_from_tiles_all_over_it(stock_map, tmp_path, monkeypatch):
+    write_tiled(tmp_path / "tiled", {(0, 0): stock_map}, 500.0, name="stock")
+    opened = open_map(tmp_path / "tiled")
+    asked = []
+    monkeypatch.setattr(type(opened), "around", lambda _, positions_of: asked.append(positions_of()))
+    part_for(opened, rig_of())
+    (positions_m,) = asked
+    places_m = opened.T_map_place[:, :3, 3]
+    assert len(positions_m) == MOST_AROUND
+    np.testing.assert_array_equal(positions_m[[0, -1]], places_m[[0, -1]])
+    assert len(np.unique(positions_m, axis=0)) == min(MOST_AROUND, len(places_m))

@@ -3,8 +3,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from service.confidence.decision import MARGIN, decision_of, extrapolated, outcome_of
+from service.confidence.decision import decision_of, outcome_of
 from service.confidence.features import FEATURES
+from service.confidence.fitted_range import MARGIN, extrapolated
 from service.confidence.spread import Extent
 from service.geometry.camera import PinholeCamera
 from service.maps.calibration import Calibration

@@ -36,6 +36,16 @@ def test_evidence_in_the_range_that_calibration_saw_gives_none(calibration, size
     assert reasons_of(calibration, evidence_of(**dict.fromkeys(FEATURES, size))) == ()
 
 
+def test_what_alone_prevents_a_pose_is_a_reason_at_any_distance(calibration_of):
+    """The range of the noise ends 2 standard deviations above the mean, and a tenth of its width further. 2.5 is beyond it, 2.3 is not."""
+    calibration = calibration_of(
+        features=[{"name": name, "mean": 2.0, "std": 0.5} for name in FEATURES],
+        right={"terms": [{"feature": "log_noise", "knots": [1.0, 3.0], "log_odds": [0.0, 0.0]}], "bias": 5.0},
+    )
+    assert reasons_of(calibration, evidence_of(log_noise=2.3)) == ()
+    assert told(reasons_of(calibration, evidence_of(log_noise=2.5))) == [("baseline", (("log_noise", 2.5),))]
+
+
 def test_the_likeliest_reason_comes_first_and_each_remedy_appears_once(calibration):
     evidence = evidence_of(
         margin=-5, front=4, through=8, points=-3.5, measured=-4, scale=6, facings=-10, similarity=-9, inliers=-2

@@ -4,6 +4,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from service.confidence.reasons import Reason
 from service.contract.schema import LocalizeRequest
 from service.doctor import on_map
 from service.doctor.on_map import answer_of, check_answer, check_rows, rows_of_camera
@@ -90,6 +91,19 @@ def test_a_confidence_that_is_extrapolated_is_a_warning(pair, localizer, monkeyp
     told = check_answer(pair, localizer, 0.02)
     assert (told.level, "front +5.0 standard deviations" in told.text) == ("warning", True)
     assert "calibrate" in told.remedy
+
+
+@pytest.mark.parametrize("reasons", [(), (Reason("baseline", (("log_noise", 2.8),), "check the stereo baseline"),)])
+def test_an_answer_that_is_refused_because_it_is_extrapolated_says_so(pair, localizer, monkeypatch, reasons):
+    outside = (("log_noise", 2.76),)
+    found = replace(
+        answer_of(pair, localizer, 0.01), status="AMBIGUOUS", confidence=0.99, extrapolated=outside, reasons=reasons
+    )
+    monkeypatch.setattr(on_map, "answer_of", lambda *_: found)
+    told = check_answer(pair, localizer, 0.01)
+    assert told.text.startswith("AMBIGUOUS (confidence 0.990), extrapolated: log_noise +2.8 standard deviations")
+    assert "calibrate --map --drive" in told.remedy
+    assert ("check the stereo baseline" in told.remedy) == bool(reasons)
 
 
 def test_the_correction_for_the_rig_is_named(pair, localizer, monkeypatch):

@@ -69,8 +69,7 @@ def calibration(threshold: float) -> Calibration:
 
 def in_range(monkeypatch: pytest.MonkeyPatch, outside: tuple[tuple[str, float], ...] = ()) -> None:
     """Replace the check of the calibration's range by a result."""
-    for module in (agreement, decision):
-        monkeypatch.setattr(module, "extrapolated", lambda *_: outside)
+    monkeypatch.setattr(decision, "extrapolated", lambda *_: outside)
 
 
 class Scripted(Localizer):

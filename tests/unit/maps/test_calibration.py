@@ -259,11 +259,11 @@ def test_many_answers_get_the_confidence_that_each_gets_alone(calibration_of, se
 
 @pytest.mark.parametrize(
     ("rate", "confidence"),
-    [(0.001, 0.9), (0.005, 0.8), (0.0049, 0.9), (0.007, 0.8), (0.01, 0.4), (0.5, 0.4), (0.0001, 0.9)],
+    [(0.001, 0.9), (0.005, 0.8), (0.0049, 0.9), (0.007, 0.8), (0.01, 0.6), (0.02, 0.5), (0.5, 0.5), (0.0001, 0.9)],
 )
 def test_the_threshold_is_that_of_the_largest_rate_not_above_the_requested_one(calibration_of, rate, confidence):
-    """Below the smallest measured rate, the threshold is the strictest one."""
-    rates = {0.001: 0.9, 0.005: 0.8, 0.01: 0.4}
+    """Below the smallest measured rate, the threshold is the strictest one. No threshold accepts what is more likely wrong than right."""
+    rates = {0.001: 0.9, 0.005: 0.8, 0.01: 0.6, 0.02: 0.3}
     thresholds = [{"false_accept_rate": each, "confidence": at} for each, at in rates.items()]
     assert calibration_of(thresholds=thresholds).threshold(rate) == confidence
 

@@ -214,10 +214,10 @@ OF_RIG = [{"false_accept_rate": 0.05, "confidence": 0.8}, {"false_accept_rate": 
 @pytest.mark.parametrize(
     ("rate", "of_map", "expected"),
     [
-        (0.05, 0.4, (0.05, 0.8)),  # the recording supports the rate
-        (0.07, 0.4, (0.05, 0.8)),
-        (0.1, 0.4, (0.1, 0.3)),
-        (0.01, 0.4, (0.05, 0.8)),  # it does not: the stricter of both, with its rate
+        (0.05, 0.6, (0.05, 0.8)),  # the recording supports the rate
+        (0.07, 0.6, (0.05, 0.8)),
+        (0.1, 0.6, (0.1, 0.5)),
+        (0.01, 0.6, (0.05, 0.8)),  # it does not: the stricter of both, with its rate
         (0.01, 0.9, (0.01, 0.9)),
     ],
 )
@@ -335,3 +335,17 @@ def test_a_killed_process_leaves_the_old_bundle(calibrated):
     assert subprocess.run([sys.executable, "-c", program, str(calibrated)], check=False).returncode == -9
     assert MapBundle.open(calibrated).manifest.version == version
     assert all(child.name.endswith(".partial") for child in calibrated.parent.iterdir() if child != calibrated)
+
+
+def test_a_correction_without_ranges_keeps_the_bytes_of_an_earlier_release(calibration_of):
+    calibration = calibration_of(rigs=[made_for("a", KEY)])
+    assert "ranges" not in json.loads(calibration.model_dump_json())["rigs"][0]
+    ranges = [{"feature": "log_noise", "least": -8.0, "most": -3.0}]
+    widened = calibration_of(rigs=[made_for("a", KEY, ranges=ranges)])
+    assert json.loads(widened.model_dump_json())["rigs"][0]["ranges"] == ranges
+
+
+def test_a_range_whose_ends_are_swapped_is_refused(calibration_of):
+    ranges = [{"feature": "log_noise", "least": -3.0, "most": -8.0}]
+    with pytest.raises(ValidationError, match="log_noise: least is larger than most"):
+        calibration_of(rigs=[made_for("a", KEY, ranges=ranges)])
