@@ -18,6 +18,7 @@ from model_training.importing.trajectory import Sync, Trajectory
 from model_training.odometry.align_poses import ALIGNED_KINDS, usual_poses
 from service.errors import DatasetError
 from service.imaging.pca import USUAL_LIDAR_HEIGHT_M
+from service.option_limits import LEAST_BASELINE_M, MOST_BASELINE_M
 
 #: Frames without poses, each a place of its own, are imported another way than drives.
 SINGLE_FRAMES = "kitti-object"
@@ -64,7 +65,7 @@ def command(
     topic: Annotated[
         list[str] | None,
         typer.Option(
-            help=f"Topic of a bag, ROLE=NAME. Roles: {', '.join(ROLES)}. Repeat for several.  [default: guessed]"
+            help=f"Topic of a bag, ROLE=NAME. Roles: {', '.join(ROLES)}. Repeat for several.  [default: guessed, except right_info]"
         ),
     ] = None,
     extrinsics: Annotated[
@@ -76,6 +77,15 @@ def command(
         typer.Option(
             help="JSON file with width, height, fx, fy, cx and cy, if the recording lacks them. distortion and "
             "distortion_model describe a lens, as in a request.",
+        ),
+    ] = None,
+    baseline_m: Annotated[
+        float | None,
+        typer.Option(
+            help="Baseline of the stereo rig that measured the recorded depth, metres: the distance of its cameras. rosbag takes it from "
+            "--topic right_info=NAME too, the CameraInfo of the rectified right camera. `evaluate` and `calibrate` then send the baseline.",
+            min=LEAST_BASELINE_M,
+            max=MOST_BASELINE_M,
         ),
     ] = None,
     align: Annotated[
@@ -126,6 +136,7 @@ def command(
     Example:
       streetfix import kitti-raw 2011_09_26_drive_0005_sync --depth sgbm --out data/drive
       streetfix import rosbag drive.mcap --topic scan=/ouster/points --out data/drive
+      streetfix import rosbag drive.mcap --topic right_info=/stereo/right/camera_info --out data/drive
       streetfix import clouds scans/ --odometry --out data/site
       streetfix import kitti-object KITTI --depth sgbm --out data/kitti
     """
@@ -154,6 +165,7 @@ def command(
         poses=poses,
         pictures=pictures,
         vertical_correction=vertical_correction,
+        baseline_m=baseline_m,
     )
     if odometry and poses is not None:
         raise DatasetError(
