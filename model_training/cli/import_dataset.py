@@ -6,9 +6,10 @@ from typing import Annotated, Literal, cast
 import typer
 from rich.console import Console
 
+from model_training.cli.import_options import SINGLE_FRAMES, kinds, refuse_options_of_images, refuse_unused
 from model_training.cli.progress import Report, bars
 from model_training.importing.extrinsics import read_camera, read_extrinsics
-from model_training.importing.kinds import KINDS, DepthFrom, OpenSettings, open_recording
+from model_training.importing.kinds import DepthFrom, OpenSettings, open_recording
 from model_training.importing.kitti_object import import_kitti_object
 from model_training.importing.pose_file import read_pose_file
 from model_training.importing.recording import Recording
@@ -20,10 +21,8 @@ from service.errors import DatasetError
 from service.imaging.pca import USUAL_LIDAR_HEIGHT_M
 from service.option_limits import LEAST_BASELINE_M, MOST_BASELINE_M
 
-#: Frames without poses, each a place of its own, are imported another way than drives.
-SINGLE_FRAMES = "kitti-object"
 DEPTHS = ("recorded", "stored", "sgbm", "lidar")
-_HELP = f"Format: {', '.join(sorted([*KINDS, SINGLE_FRAMES]))}."
+_HELP = f"Format: {', '.join(kinds())}."
 
 
 def command(
@@ -42,26 +41,30 @@ def command(
         Path | None,
         typer.Option(help="TUM file (timestamp x y z qx qy qz qw). It replaces the recording's own poses."),
     ] = None,
-    queries: Annotated[str, typer.Option(help="Query set for the images.")] = "recorded",
-    pictures: Annotated[bool, typer.Option(help="Import images.")] = True,
+    queries: Annotated[str | None, typer.Option(help="Query set for the images.  [default: recorded]")] = None,
+    pictures: Annotated[bool | None, typer.Option(help="Import images.  [default: pictures]")] = None,
     hold_out: Annotated[
-        int,
+        int | None,
         typer.Option(
             help="Leave one scan in this many out of the survey. Only images near these scans become queries. "
-            "0 leaves none out.",
+            "0 leaves none out.  [default: 0]",
             min=0,
         ),
-    ] = 0,
+    ] = None,
     hold_out_first: Annotated[
         int | None,
         typer.Option(
             help="With --hold-out: the first scan left out, counted from 0.  [default: the last of each group]", min=0
         ),
     ] = None,
-    sync: Annotated[str, typer.Option(help="Method for the pose of a frame: interpolate or nearest.")] = "interpolate",
+    sync: Annotated[
+        str | None,
+        typer.Option(help="Method for the pose of a frame: interpolate or nearest.  [default: interpolate]"),
+    ] = None,
     tolerance: Annotated[
-        float, typer.Option(help="Largest time from a frame to its pose or scan, seconds.", min=0)
-    ] = 0.1,
+        float | None,
+        typer.Option(help="Largest time from a frame to its pose or scan, seconds.  [default: 0.1]", min=0),
+    ] = None,
     topic: Annotated[
         list[str] | None,
         typer.Option(
@@ -100,26 +103,33 @@ def command(
     odometry: Annotated[
         bool,
         typer.Option(
-            help="Find the poses by LiDAR odometry. The command ignores the recording's own poses. Needs the extra odometry."
+            "--odometry",
+            help="Find the poses by LiDAR odometry. The command ignores the recording's own poses. Needs the extra odometry.",
         ),
     ] = False,
     loops: Annotated[
-        bool, typer.Option(help="With --odometry: close loops at places that the vehicle visits again.")
-    ] = True,
+        bool | None,
+        typer.Option(help="With --odometry: close loops at places that the vehicle visits again.  [default: loops]"),
+    ] = None,
     lidar_height: Annotated[
-        float, typer.Option(help="With --odometry: approximate height of the LiDAR above the ground, metres.", min=0.1)
-    ] = USUAL_LIDAR_HEIGHT_M,
+        float | None,
+        typer.Option(
+            help="With --odometry: approximate height of the LiDAR above the ground, metres.  "
+            f"[default: {USUAL_LIDAR_HEIGHT_M:g}]",
+            min=0.1,
+        ),
+    ] = None,
     rectified: Annotated[
         bool | None,
         typer.Option(help="The images of a bag are rectified already.  [default: if the topic's name says so]"),
     ] = None,
     deskew: Annotated[
-        bool,
+        bool | None,
         typer.Option(
             help="Remove the vehicle's motion from scans with point times. For kitti-raw and kitti-360 the azimuth "
-            "gives the times."
+            "gives the times.  [default: deskew]"
         ),
-    ] = True,
+    ] = None,
     vertical_correction: Annotated[
         bool | None,
         typer.Option(
@@ -130,7 +140,7 @@ def command(
 ) -> None:
     """Import a recording into a dataset folder.
 
-    The command leaves out unusable frames. It counts them by reason.
+    The command leaves out unusable frames. It counts them by reason. It refuses an option that the format does not use.
 
     \b
     Example:
@@ -142,18 +152,41 @@ def command(
     """
     if depth and depth not in DEPTHS:
         raise DatasetError(f"depth: {depth!r} is not valid; choose one of: {', '.join(DEPTHS)}", field="depth")
+    given: dict[str, object] = {
+        "depth": depth or None,
+        "poses": poses,
+        "queries": queries,
+        "pictures": pictures,
+        "hold-out": hold_out,
+        "hold-out-first": hold_out_first,
+        "sync": sync,
+        "tolerance": tolerance,
+        "topic": topic,
+        "extrinsics": extrinsics,
+        "camera": camera,
+        "baseline-m": baseline_m,
+        "align": align,
+        "odometry": odometry or None,
+        "loops": loops,
+        "lidar-height": lidar_height,
+        "rectified": rectified,
+        "deskew": deskew,
+        "vertical-correction": vertical_correction,
+    }
+    refuse_unused(kind, given)
     if kind == SINGLE_FRAMES:
         _single_frames(source, out, depth or "sgbm")
         return
-    if sync not in ("interpolate", "nearest"):
+    if sync not in (None, "interpolate", "nearest"):
         raise DatasetError(f"sync: {sync!r} is not valid; choose interpolate or nearest", field="sync")
+    with_pictures = pictures is not False
     settings = TakeSettings(
-        queries=queries if pictures else "",
+        queries=(queries or "recorded") if with_pictures else "",
         depth="lidar" if depth == "lidar" else "recorded",
-        sync=cast(Sync, sync),
-        tolerance_s=tolerance,
-        deskew=deskew,
-        hold_out=hold_out,
+        sync=cast(Sync, sync or "interpolate"),
+        tolerance_s=0.1 if tolerance is None else tolerance,
+        deskew=deskew is not False,
+        hold_out=hold_out or 0,
         hold_out_first=hold_out_first,
     )
     open_settings = OpenSettings(
@@ -163,7 +196,7 @@ def command(
         camera=None if camera is None else read_camera(camera),
         extrinsics=None if extrinsics is None else read_extrinsics(extrinsics),
         poses=poses,
-        pictures=pictures,
+        pictures=with_pictures,
         vertical_correction=vertical_correction,
         baseline_m=baseline_m,
     )
@@ -171,18 +204,21 @@ def command(
         raise DatasetError(
             "poses: --odometry finds the poses, so --poses has no effect; give one of the two", field="poses"
         )
-    if odometry and align:
+    if odometry and align is not None:
         raise DatasetError("align: --odometry finds poses from the scans alone; give one of the two", field="align")
     recording = open_recording(kind, source, open_settings)
+    if not recording.has_images:
+        refuse_options_of_images(source, given)
     console = Console()
-    for line in (*recording.notes.lines, *(recording.notes.picture_lines if pictures else ())):
+    for line in (*recording.notes.lines, *(recording.notes.picture_lines if with_pictures else ())):
         console.print(line, soft_wrap=True)
     if not odometry:
         trajectory = _trajectory(recording, source, poses)
     with bars() as report:
         told_of_poses: str | None
         if odometry:
-            trajectory, told_of_poses = _by_odometry(recording, loops, lidar_height, report)
+            height_m = USUAL_LIDAR_HEIGHT_M if lidar_height is None else lidar_height
+            trajectory, told_of_poses = _by_odometry(recording, loops is not False, height_m, report)
         else:
             of_file = False if poses is not None and align is None else align
             trajectory, told_of_poses = usual_poses(recording, trajectory, align=of_file, report=report)

@@ -56,7 +56,7 @@ class Kind:
     Attributes:
         open: its reader.
         depths: sources of depth that it offers.
-        takes: settings that concern only some formats, and this one.
+        takes: options of ``streetfix import`` that it uses, without dashes.
     """
 
     open: Callable[[Path, OpenSettings], Recording]
@@ -64,7 +64,7 @@ class Kind:
     takes: frozenset[str] = frozenset()
 
 
-#: Settings that concern only some formats, and their options on the command line.
+#: Settings of a reader that concern only some formats, and their options on the command line.
 _OPTIONS = {
     "topics": "topic",
     "extrinsics": "extrinsics",
@@ -103,7 +103,7 @@ def _refuse_what_does_not_apply(kind: str, settings: OpenSettings) -> None:
             f"depth: {kind} has no {settings.depth!r} depth; choose one of: {', '.join(known.depths)}", field="depth"
         )
     for field_name, option in _OPTIONS.items():
-        if field_name not in known.takes and getattr(settings, field_name) != getattr(unasked, field_name):
+        if option not in known.takes and getattr(settings, field_name) != getattr(unasked, field_name):
             raise DatasetError(f"{option}: {kind} does not support this option; omit it", field=option)
     _refuse_baseline_without_its_depth(settings)
 
@@ -196,16 +196,23 @@ def _kitti_depth(depth: DepthFrom) -> Literal["none", "stored", "sgbm"]:
 
 
 _KITTI: tuple[DepthFrom, ...] = ("recorded", "stored", "sgbm", "lidar")
+#: Options of every drive: its poses, and the scans that the survey leaves out.
+_DRIVE = frozenset({"poses", "align", "odometry", "loops", "lidar-height", "hold-out", "hold-out-first"})
+#: Options of drives with images. Without images, each scan has a pose at its own time, so ``sync`` and ``tolerance`` have no effect.
+_FILMED = _DRIVE | {"pictures", "queries", "sync", "tolerance"}
+_RGBD = _FILMED | {"camera", "baseline-m"}
 #: All formats by name.
 KINDS: dict[str, Kind] = {
-    "kitti-raw": Kind(_kitti_raw, _KITTI, frozenset({"vertical_correction"})),
-    "kitti-odometry": Kind(_kitti_odometry, _KITTI, frozenset({"vertical_correction"})),
-    "kitti-360": Kind(_kitti_360, ("recorded", "sgbm", "lidar")),
+    "kitti-raw": Kind(_kitti_raw, _KITTI, _FILMED | {"depth", "deskew", "vertical-correction"}),
+    "kitti-odometry": Kind(_kitti_odometry, _KITTI, _FILMED | {"depth", "vertical-correction"}),
+    "kitti-360": Kind(_kitti_360, ("recorded", "sgbm", "lidar"), _FILMED | {"depth", "deskew"}),
     "rosbag": Kind(
-        _rosbag, ("recorded", "lidar"), frozenset({"topics", "extrinsics", "camera", "rectified", "baseline_m"})
+        _rosbag,
+        ("recorded", "lidar"),
+        _FILMED | {"depth", "deskew", "topic", "extrinsics", "camera", "rectified", "baseline-m"},
     ),
-    "carla": Kind(_carla, ("recorded", "lidar")),
-    "clouds": Kind(_clouds, ("recorded",)),
-    "open3d": Kind(_open3d, ("recorded",), frozenset({"camera", "baseline_m"})),
-    "tum-rgbd": Kind(_tum_rgbd, ("recorded",), frozenset({"camera", "baseline_m"})),
+    "carla": Kind(_carla, ("recorded", "lidar"), _FILMED | {"depth"}),
+    "clouds": Kind(_clouds, ("recorded",), _DRIVE),
+    "open3d": Kind(_open3d, ("recorded",), _RGBD),
+    "tum-rgbd": Kind(_tum_rgbd, ("recorded",), _RGBD),
 }

@@ -126,6 +126,10 @@ class Recording(Protocol):
     def georeference(self) -> dict[str, Any] | None:
         """Georeference of the map frame of the recording's poses, or None."""
 
+    @property
+    def has_images(self) -> bool:
+        """Whether the recording has images."""
+
     def count(self) -> int:
         """Count scans and images together, for a progress bar."""
 

@@ -82,6 +82,11 @@ class RgbdFolder:
         hints = (BASELINE_HINT.format(""),) if self.baseline_m is None else ()
         return Notes((line,), {"path": self.path.name}, hints)
 
+    @property
+    def has_images(self) -> bool:
+        """Whether the recording has images."""
+        return bool(self.frames)
+
     def count(self) -> int:
         """Count one scan and one image per frame."""
         return 2 * len(self.frames)

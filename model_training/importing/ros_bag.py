@@ -70,6 +70,11 @@ class RosBag:
         or_topic = ", or its right CameraInfo with --topic right_info=NAME"
         return Notes(lines, source, (BASELINE_HINT.format(or_topic),) if unknown else ())
 
+    @property
+    def has_images(self) -> bool:
+        """Whether the recording has images."""
+        return self._content.topics.color is not None
+
     def count(self) -> int:
         """Count scans and colour images."""
         topics = self._content.topics

@@ -84,12 +84,14 @@ def test_missing_entries_of_tum_lists_are_named(tum, file, text, why):
         open_tum_rgbd(tum, CAMERA)
 
 
-def test_the_depth_of_a_stereo_camera_carries_its_baseline(tum, open3d):
-    for folder in (open_tum_rgbd(tum, CAMERA, 0.05), open_open3d(open3d, None, 0.05)):
-        pictures = [event for event in folder.events() if isinstance(event, RecordedPicture)]
-        assert [picture.baseline_m for picture in pictures] == [0.05, 0.05]
-        assert folder.notes.picture_lines == ()
-    (hint,) = open_open3d(open3d, None).notes.picture_lines
+@pytest.mark.parametrize("layout", ["tum", "open3d"])
+def test_the_depth_of_a_stereo_camera_carries_its_baseline(layout, request):
+    source, opened = request.getfixturevalue(layout), {"tum": open_tum_rgbd, "open3d": open_open3d}[layout]
+    folder = opened(source, CAMERA, 0.05)
+    pictures = [event for event in folder.events() if isinstance(event, RecordedPicture)]
+    assert [picture.baseline_m for picture in pictures] == [0.05, 0.05]
+    assert folder.notes.picture_lines == ()
+    (hint,) = opened(source, CAMERA).notes.picture_lines
     assert "give the distance of its cameras with --baseline-m METRES; `evaluate` and" in hint
 
 
