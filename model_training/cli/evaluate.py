@@ -1,6 +1,7 @@
 """``streetfix evaluate``."""
 
 import json
+from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -20,7 +21,7 @@ from model_training.evaluation.predict import Predictions
 from model_training.evaluation.raw_range import raw_best_views
 from model_training.evaluation.saved_run import save_run
 from model_training.evaluation.stages import stages_of
-from model_training.evaluation.why_refused import FEW, causes
+from model_training.evaluation.why_refused import FEW, NO_CAUSE, causes
 from service.errors import DatasetError
 from service.localization.localizer import Localizer
 from service.maps.map import Map
@@ -129,6 +130,7 @@ def command(
         traced = (
             {name: stages_of(Localizer.open(opened), data, name, report=report) for name in names} if stages else {}
         )
+    _add_causes(figures, opened, data, result.predictions)
     if stages:
         figures["stages"] = {name: [each.as_json() for each in found] for name, found in traced.items()}
     if trajectory is not None:
@@ -144,7 +146,7 @@ def command(
         part.write_text(json.dumps(figures, indent=1) + "\n")
         part.rename(json_file)
     Console().print(_table(figures))
-    _say_why(opened, data, result.predictions)
+    _say_why(figures)
     for name, answers in result.predictions.items():
         print_queries(name, answers, Console(), most=most)
     for name, found in traced.items():
@@ -180,25 +182,29 @@ def _raw_figures(right: dict[str, NDArray[np.bool_]], queries: slice) -> dict[st
     return {"raw_recall_at_1_5m": recalls[best], "raw": {"best_setting": best, "recall_at_1_5m": recalls}}
 
 
-def _say_why(bundle: Map, data: Dataset, predictions: dict[str, Predictions]) -> None:
-    """Print what to check if few answers were accepted or the focal length is suspicious, the likeliest cause first."""
-    console = Console(soft_wrap=True, highlight=False)
+def _add_causes(figures: dict[str, Any], bundle: Map, data: Dataset, predictions: dict[str, Predictions]) -> None:
+    """Add what to check to the figures of each set, if few answers were accepted or the focal length is suspicious, the likeliest first."""
+    if bundle.calibration is None:
+        return
     for name, answers in predictions.items():
-        if bundle.calibration is None:
-            continue
         found = causes(Localizer.open(bundle), list(data.queries(name)), answers)
-        if answers.localized.mean() >= FEW and not found:
+        figures["sets"][name]["causes"] = [asdict(cause) for cause in found]
+
+
+def _say_why(figures: dict[str, Any]) -> None:
+    """Print what to check in each set, the likeliest cause first."""
+    console = Console(soft_wrap=True, highlight=False)
+    for name, values in figures["sets"].items():
+        found = values.get("causes")
+        if found is None or (values["localized"] >= FEW and not found):
             continue
         console.print(
-            f"{name}: {answers.localized.mean():.0%} of the answers are accepted. What to check, the likeliest first:"
+            f"{name}: {values['localized']:.0%} of the answers are accepted. What to check, the likeliest first:"
         )
         for number, cause in enumerate(found, 1):
-            console.print(f"  {number}. {cause}")
+            console.print(f"  {number}. {cause['what']}: {cause['check']}")
         if not found:
-            console.print(
-                "  All confidence features are in the range of the calibration data. The place may be outside the map "
-                "or a perceptual alias."
-            )
+            console.print(f"  {NO_CAUSE}")
 
 
 def _table(figures: dict[str, Any]) -> Table:

@@ -9,6 +9,7 @@ from model_training.datasets.dataset import Dataset
 from model_training.evaluation.failures import WHY, Stage, position_errors, stages, worst
 from model_training.evaluation.predict import Predictions, joined
 from model_training.evaluation.saved_run import SavedRun
+from model_training.evaluation.why_refused import FEW, NO_CAUSE
 from model_training.reporting.charts import (
     error_curve,
     error_histogram,
@@ -61,6 +62,8 @@ def write_run_page(run: SavedRun, bundle: Map, dataset: Dataset, figures: dict[s
         Section("map", "The map, coloured by error", _map(plan, everything)),
         Section("lost", "Losses by stage", _lost(everything)),
     ]
+    if causes := causes_of(figures):
+        sections.insert(1, Section("causes", "What to check", causes))
     if len(run.predictions) > 1:
         sections.insert(1, Section("conditions", "Conditions", _conditions(run, figures)))
     if figures.get("confusion"):
@@ -144,6 +147,25 @@ def _conditions(run: SavedRun, figures: dict[str, Any]) -> str:
         ["set", "condition", "split", "answered", "within 1 m", "R@1 at 5 m"],
         rows,
     ) + _pair(drawn)
+
+
+def causes_of(figures: dict[str, Any]) -> str:
+    """Return the possible causes of each set as HTML, the likeliest first; empty if nothing is to be checked.
+
+    Args:
+        figures: figures of the evaluation, with the causes that ``streetfix evaluate`` adds for a calibrated map.
+    """
+    parts = []
+    for name, values in figures["sets"].items():
+        found = values.get("causes")
+        if found is None or (values["localized"] >= FEW and not found):
+            continue
+        listed = "".join(f"<li>{escape(each['what'])}: {escape(each['check'])}</li>" for each in found)
+        told = f"<ol>{listed}</ol>" if found else f"<p>{NO_CAUSE}</p>"
+        parts.append(
+            f"<p>{escape(name)}: {values['localized']:.0%} of the answers were accepted. The likeliest cause first.</p>{told}"
+        )
+    return "".join(parts)
 
 
 def _errors(runs: dict[str, Predictions], everything: Predictions) -> str:

@@ -11,8 +11,10 @@ import pytest
 
 from model_training.cli import evaluate as module
 from model_training.datasets.dataset import Dataset
+from model_training.evaluation.why_refused import NO_CAUSE, Cause
 from service.cli.main import main
 from service.maps.reader import MapBundle
+from service.maps.writer import replace_calibration
 
 
 def run(*arguments: object) -> int:
@@ -87,6 +89,43 @@ def test_a_report_folder_holds_page_answers_and_settings(
         "answers/drive1_precise.npz",
     }
     assert f"report: {tmp_path}/runs/one/index.html" in capsys.readouterr().out.replace("\n", "")
+
+
+@pytest.fixture
+def calibrated(small_map: Path, tmp_path: Path, calibration_json: Callable[..., dict[str, Any]]) -> Path:
+    """Return the small map with a calibration for its encoder."""
+    folder = shutil.copytree(small_map, tmp_path / "town")
+    sha256 = MapBundle.open(small_map).manifest.encoder_sha256
+    replace_calibration(folder, calibration_json(measured_on={"encoder_sha256": sha256}))
+    return folder
+
+
+def test_what_to_check_is_printed_and_in_the_figures_and_the_report(
+    small_dataset: Dataset,
+    calibrated: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(module, "causes", lambda *_: [Cause("the depth unit is off", "check <scale_m>")])
+    given = ("--json", tmp_path / "found.json", "--report", tmp_path / "page")
+    assert run("evaluate", calibrated, small_dataset.folder, *given) == 0
+    assert "  1. the depth unit is off: check <scale_m>" in capsys.readouterr().out
+    for file in (tmp_path / "found.json", tmp_path / "page" / "figures.json"):
+        figures = json.loads(file.read_text())
+        causes = [{"what": "the depth unit is off", "check": "check <scale_m>"}]
+        assert figures["sets"]["drive1_precise"]["causes"] == causes
+    page = (tmp_path / "page" / "index.html").read_text()
+    assert "<li>the depth unit is off: check &lt;scale_m&gt;</li>" in page
+
+
+def test_a_report_says_that_nothing_is_out_of_range_only_if_few_answers_are_accepted() -> None:
+    from model_training.reporting.run_page import causes_of
+
+    few, many = ({"sets": {"one": {"localized": share, "causes": []}}} for share in (0.2, 0.25))
+    assert NO_CAUSE in causes_of(few)
+    assert causes_of(many) == ""
+    assert causes_of({"sets": {"one": {"localized": 0.0}}}) == ""  # not calibrated
 
 
 def test_forced_figures_stand_beside_accepted_ones_and_every_error_has_its_status(
