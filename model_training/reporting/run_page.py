@@ -68,7 +68,7 @@ def write_run_page(run: SavedRun, bundle: Map, dataset: Dataset, figures: dict[s
         sections.insert(1, Section("conditions", "Conditions", _conditions(run, figures)))
     if figures.get("confusion"):
         sections.append(Section("streets", "Streets", _confusion(figures["confusion"])))
-    sections.append(Section("worst", "The worst queries", _worst(run.predictions, everything, dataset, plan)))
+    sections.append(Section("worst", "The worst queries", _worst(run, everything, dataset, plan)))
     path = run.folder / PAGE
     write_page(path, page(f"{run.settings.dataset.name} on map {run.settings.map.name}", _lead(run, figures), sections))
     return path
@@ -83,6 +83,7 @@ def _lead(run: SavedRun, figures: dict[str, Any]) -> str:
         f"(95 % interval {low:.1%} to {high:.1%}); {figures['localized']:.1%} were accepted at all.</p>"
         f'<p class="soft">Map {escape(settings.map.name)}, version {escape(settings.map.version)}; dataset '
         f"{escape(settings.dataset.name)}; "
+        f"{escape(settings.described())}; "
         f"{'registered on the cloud' if settings.registered else 'retrieval alone'}; {escape(made)}; "
         f"{settings.made_at:%Y-%m-%d %H:%M} UTC.</p>"
     )
@@ -247,11 +248,13 @@ def _confusion(confusion: dict[str, Any]) -> str:
     )
 
 
-def _worst(runs: dict[str, Predictions], everything: Predictions, dataset: Dataset, plan: Plan) -> str:
+def _worst(run: SavedRun, everything: Predictions, dataset: Dataset, plan: Plan) -> str:
     became, errors = stages(everything), position_errors(everything)
     shown = [
         Shown(name, number, row, said_of(everything, row, became[row], errors[row]))
-        for name, number, row in locate(worst(everything, WORST), runs)
+        for name, number, row in locate(
+            worst(everything, WORST), run.predictions, first_image=run.settings.mode.frames - 1
+        )
     ]
     words = (
         "<p>Accepted wrong answers come first, then the others by distance. On the small maps the circle is the true "

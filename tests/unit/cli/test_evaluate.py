@@ -154,3 +154,43 @@ def test_a_dataset_in_the_place_of_the_map_is_named(
     )
     assert run("map", "update", small_dataset.folder, small_map, "--out", small_map.parent / "no") == 1
     assert f"streetfix map update {small_map} {small_dataset.folder}" in capsys.readouterr().err
+
+
+def test_the_mode_is_in_the_table_the_figures_the_list_and_the_report(
+    small_dataset: Dataset, small_map: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    given = ("--frames", "4", "--prior-std-m", "3", "--json", tmp_path / "found.json", "--report", tmp_path / "page")
+    assert run("evaluate", small_map, small_dataset.folder, *given) == 0
+    told, mode = capsys.readouterr().out, "4 consecutive images in one query, prior of 3 m"
+    assert mode in " ".join(told.split())
+    assert "ground truth, with simulated errors" in told
+    listed = told.split("all 2 queries")[1]
+    assert sorted(line.split()[0] for line in listed.splitlines() if "LOCALIZED" in line) == ["3", "4"]
+    figures = json.loads((tmp_path / "found.json").read_text())
+    assert (figures["mode"], figures["queries"]) == ({"frames": 4, "prior_std_m": 3.0, "track": False}, 2)
+    assert figures["sets"]["drive1_precise"]["odometry"] == "ground truth, with simulated errors"
+    page = (tmp_path / "page" / "index.html").read_text()
+    assert f"{mode}, relative poses from ground truth, with simulated errors" in page
+    assert "drive1_precise, query 4" in page
+    assert "drive1_precise, query 0" not in page
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (("--frames", "3", "--track"), "--frames and --track exclude each other"),
+        (("--track", "--workers", "2"), "--workers and --track exclude each other"),
+        (("--track", "--no-refine"), "--no-refine and --track exclude each other"),
+        (("--track", "--stages"), "leave out --stages or --track"),
+        (("--frames", "3", "--stages"), "leave out --stages or --frames"),
+        (("--prior-std-m", "3", "--stages"), "leave out --stages or --prior-std-m"),
+        (("--frames", "3", "--raw-baseline"), "leave out --raw-baseline or --frames"),
+        (("--frames", "17"), "--frames': Input should be less than or equal to 16"),
+    ],
+)
+def test_modes_that_do_not_go_together_are_refused(
+    options: tuple[str, ...], message: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("COLUMNS", "200")
+    assert run("evaluate", "map", "data", *options) == 2
+    assert message in " ".join(capsys.readouterr().err.split())
