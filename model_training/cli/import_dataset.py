@@ -16,7 +16,7 @@ from model_training.importing.recording import Recording
 from model_training.importing.ros_topics import ROLES
 from model_training.importing.take import TakeSettings, TakeSummary, take
 from model_training.importing.trajectory import Sync, Trajectory
-from model_training.odometry.align_poses import ALIGNED_KINDS, usual_poses
+from model_training.odometry.align_poses import ALIGNED_KINDS, HOW_TO_ALIGN, usual_poses
 from service.errors import DatasetError
 from service.imaging.pca import USUAL_LIDAR_HEIGHT_M
 from service.option_limits import LEAST_BASELINE_M, MOST_BASELINE_M
@@ -220,8 +220,11 @@ def command(
             height_m = USUAL_LIDAR_HEIGHT_M if lidar_height is None else lidar_height
             trajectory, told_of_poses = _by_odometry(recording, loops is not False, height_m, report)
         else:
-            of_file = False if poses is not None and align is None else align
-            trajectory, told_of_poses = usual_poses(recording, trajectory, align=of_file, report=report)
+            of_file = poses is not None and align is None
+            trajectory, told_of_poses = usual_poses(
+                recording, trajectory, align=False if of_file else align, report=report
+            )
+            told_of_poses = f"poses are those of {poses}; {HOW_TO_ALIGN}" if of_file else told_of_poses
     if told_of_poses:
         console.print(told_of_poses, soft_wrap=True)
     with bars() as report:

@@ -67,9 +67,11 @@ def test_help_says_which_options_need_an_extra(capsys):
     assert "The command ignores the recording's own poses. Needs the extra odometry." in told
 
 
-def test_import_takes_poses_of_another_file(scans, tmp_path):
+def test_import_takes_poses_of_another_file(scans, tmp_path, capsys):
     poses = (scans / "poses.txt").rename(tmp_path / "mine.txt")
     assert run("import", "clouds", scans, "--poses", poses, "--out", tmp_path / "out") == 0
+    told = capsys.readouterr().out.replace("\n", " ")
+    assert f"poses are those of {poses}; if they err by decimetres, --align corrects them with the scans" in told
     np.testing.assert_allclose(Dataset(tmp_path / "out").survey_poses()[:, 0, 3], [0, 1, 2])
 
 
