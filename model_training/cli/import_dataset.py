@@ -11,6 +11,7 @@ from model_training.cli.progress import Report, bars
 from model_training.importing.extrinsics import read_camera, read_extrinsics
 from model_training.importing.kinds import DepthFrom, OpenSettings, open_recording
 from model_training.importing.kitti_object import import_kitti_object
+from model_training.importing.map_origin import read_map_origin
 from model_training.importing.pose_file import read_pose_file
 from model_training.importing.recording import Recording
 from model_training.importing.ros_topics import ROLES
@@ -119,6 +120,15 @@ def command(
             min=0.1,
         ),
     ] = None,
+    georeference: Annotated[
+        str | None,
+        typer.Option(
+            metavar="LAT,LON[,HEIGHT[,HEADING]]",
+            help="WGS-84 position of the origin of the poses: degrees, degrees, metres above the ellipsoid. HEADING is the direction of "
+            "their x axis, degrees counter-clockwise from east. Streets in WGS-84 (`streets osm`) and GeoPose answers need it. kitti-raw "
+            "has a georeference of its own.",
+        ),
+    ] = None,
     rectified: Annotated[
         bool | None,
         typer.Option(help="The images of a bag are rectified already.  [default: if the topic's name says so]"),
@@ -148,6 +158,7 @@ def command(
       streetfix import rosbag drive.mcap --topic scan=/ouster/points --out data/drive
       streetfix import rosbag drive.mcap --topic right_info=/stereo/right/camera_info --out data/drive
       streetfix import clouds scans/ --odometry --out data/site
+      streetfix import rosbag drive.mcap --georeference 48.98,8.44,110,90 --out data/town
       streetfix import kitti-object KITTI --depth sgbm --out data/kitti
     """
     if depth and depth not in DEPTHS:
@@ -169,6 +180,7 @@ def command(
         "odometry": odometry or None,
         "loops": loops,
         "lidar-height": lidar_height,
+        "georeference": georeference,
         "rectified": rectified,
         "deskew": deskew,
         "vertical-correction": vertical_correction,
@@ -180,6 +192,7 @@ def command(
     if sync not in (None, "interpolate", "nearest"):
         raise DatasetError(f"sync: {sync!r} is not valid; choose interpolate or nearest", field="sync")
     with_pictures = pictures is not False
+    map_origin = None if georeference is None else read_map_origin(georeference)
     settings = TakeSettings(
         queries=(queries or "recorded") if with_pictures else "",
         depth="lidar" if depth == "lidar" else "recorded",
@@ -188,6 +201,8 @@ def command(
         deskew=deskew is not False,
         hold_out=hold_out or 0,
         hold_out_first=hold_out_first,
+        georeference=None if map_origin is None else map_origin.georeference(),
+        own_frame=not odometry,
     )
     open_settings = OpenSettings(
         depth=cast(DepthFrom, depth or "recorded"),
@@ -207,6 +222,12 @@ def command(
     if odometry and align is not None:
         raise DatasetError("align: --odometry finds poses from the scans alone; give one of the two", field="align")
     recording = open_recording(kind, source, open_settings)
+    is_placed = recording.georeference is not None
+    if is_placed and map_origin is not None and poses is None and not odometry:
+        raise DatasetError(
+            f"--georeference {georeference}: the recording has a georeference of its own poses; omit this option",
+            field="georeference",
+        )
     if not recording.has_images:
         refuse_options_of_images(source, given)
     console = Console()
@@ -227,6 +248,13 @@ def command(
             told_of_poses = f"poses are those of {poses}; {HOW_TO_ALIGN}" if of_file else told_of_poses
     if told_of_poses:
         console.print(told_of_poses, soft_wrap=True)
+    if is_placed and map_origin is None and odometry:
+        console.print(
+            "the recording's georeference does not hold for poses by odometry; give that of the first scan with --georeference",
+            soft_wrap=True,
+        )
+    if map_origin is not None:
+        trajectory = map_origin.turned(trajectory)
     with bars() as report:
         summary = take(recording, trajectory, out, settings, report=report)
     _print_summary(console, out, summary)

@@ -196,8 +196,10 @@ def _kitti_depth(depth: DepthFrom) -> Literal["none", "stored", "sgbm"]:
 
 
 _KITTI: tuple[DepthFrom, ...] = ("recorded", "stored", "sgbm", "lidar")
-#: Options of every drive: its poses, and the scans that the survey leaves out.
-_DRIVE = frozenset({"poses", "align", "odometry", "loops", "lidar-height", "hold-out", "hold-out-first"})
+#: Options of every drive: its poses and their frame, and the scans that the survey leaves out.
+_DRIVE = frozenset(
+    {"poses", "align", "odometry", "loops", "lidar-height", "hold-out", "hold-out-first", "georeference"}
+)
 #: Options of drives with images. Without images, each scan has a pose at its own time, so ``sync`` and ``tolerance`` have no effect.
 _FILMED = _DRIVE | {"pictures", "queries", "sync", "tolerance"}
 _RGBD = _FILMED | {"camera", "baseline-m"}

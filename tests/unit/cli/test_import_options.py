@@ -37,6 +37,7 @@ VALUES: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
     "odometry": (("--odometry",), ()),
     "loops": (("--no-loops",), ("--odometry",)),
     "lidar-height": (("--lidar-height", "1.5"), ("--odometry",)),
+    "georeference": (("--georeference", "-33.87,151.21,20,90"), ()),
     "rectified": (("--no-rectified",), ()),
     "deskew": (("--no-deskew",), ()),
     "vertical-correction": (("--no-vertical-correction",), ()),
@@ -52,6 +53,7 @@ class Nothing:
     kind: str
     notes: Notes = field(default_factory=Notes)
     has_images: bool = True
+    georeference: dict[str, float] | None = None
 
     def trajectory(self) -> Trajectory:
         return TRAJECTORY
@@ -86,7 +88,7 @@ def calls(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[Any]:
         return Found()
 
     def taken(recording: Nothing, trajectory: Trajectory, out: Path, settings: Any, *, report: object) -> TakeSummary:
-        made.append(("take", repr(settings)))
+        made.append(("take", repr(settings), trajectory.T_map_vehicle.tolist()))
         return TakeSummary(1, 0, 0, 0, (), ())
 
     def single(source: Path, out: Path, *, depth: str, progress: object) -> KittiObjectSummary:
@@ -169,6 +171,24 @@ def test_lines_about_images_are_printed_only_if_images_are_wanted(
     assert "a list\nno image has stored depth\n" in capsys.readouterr().out
     assert run("kitti-raw", "--no-pictures") == 0
     assert "no image has stored depth" not in capsys.readouterr().out
+
+
+def test_a_georeference_of_the_recording_is_not_replaced_and_does_not_hold_for_odometry(
+    calls: list[Any], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    own = {"latitude_deg": 49.0, "longitude_deg": 8.4, "height_m": 110.0}
+    monkeypatch.setattr(import_dataset, "open_recording", lambda kind, *_: Nothing(kind, georeference=own))
+    assert run("kitti-raw", "--georeference", "50,8") == 1
+    assert "--georeference 50,8: the recording has a georeference of its own poses; omit this option" in " ".join(
+        capsys.readouterr().err.split()
+    )
+    assert run("kitti-raw", "--odometry") == 0
+    assert "does not hold for poses by odometry; give that of the first scan with --georeference" in " ".join(
+        capsys.readouterr().out.split()
+    )
+    assert "georeference=None, own_frame=False" in calls[-1][1]
+    assert run("kitti-raw", "--odometry", "--georeference", "50,8") == 0
+    assert "does not hold" not in capsys.readouterr().out
 
 
 def test_scans_from_images_need_the_camera_without_images_too(calls: list[Any]) -> None:
