@@ -257,7 +257,7 @@ def command(
         trajectory = map_origin.turned(trajectory)
     with bars() as report:
         summary = take(recording, trajectory, out, settings, report=report)
-    _print_summary(console, out, summary)
+    _print_summary(console, out, summary, deskew=settings.deskew)
 
 
 def _topics(pairs: list[str]) -> dict[str, str]:
@@ -313,14 +313,19 @@ def _single_frames(source: Path, out: Path, depth: str) -> None:
         console.print(f"left out because they have no depth: {', '.join(summary.skipped)}")
 
 
-def _print_summary(console: Console, out: Path, summary: TakeSummary) -> None:
+def _print_summary(console: Console, out: Path, summary: TakeSummary, *, deskew: bool) -> None:
     held = f" ({summary.held_out} held out)" if summary.held_out else ""
     console.print(f"{out}: {summary.scans} scans{held}, {summary.pictures} image pairs", soft_wrap=True)
     text = f"corrected for the vehicle's motion: {summary.deskewed} of {summary.scans + summary.held_out} scans"
-    console.print(
-        text + ("" if summary.deskewed else ", because their points have no times or --no-deskew was given"),
-        soft_wrap=True,
-    )
+    why = ""
+    if not deskew:
+        why = ", because --no-deskew was given"
+    elif not summary.deskewed:
+        why = (
+            ", because their points have no usable times; unless they are corrected already, record clouds with a time for each point, or "
+            "correct them before the import"
+        )
+    console.print(text + why, soft_wrap=True)
     if summary.points_without_numbers:
         console.print(f"left out: {summary.points_without_numbers} points that are not finite")
     for line in summary.dropped:

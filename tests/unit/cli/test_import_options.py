@@ -191,6 +191,35 @@ def test_a_georeference_of_the_recording_is_not_replaced_and_does_not_hold_for_o
     assert "does not hold" not in capsys.readouterr().out
 
 
+@pytest.mark.parametrize(
+    ("options", "deskewed", "line"),
+    [
+        ((), 3, "3 of 3 scans"),
+        (("--no-deskew",), 0, "0 of 3 scans, because --no-deskew was given"),
+        (
+            (),
+            0,
+            (
+                "0 of 3 scans, because their points have no usable times; unless they are corrected already, record clouds with a time for "
+                "each point, or correct them before the import"
+            ),
+        ),
+    ],
+)
+def test_scans_that_keep_the_motion_have_their_cause(
+    options: tuple[str, ...],
+    deskewed: int,
+    line: str,
+    calls: list[Any],
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    summary = TakeSummary(2, 1, 0, 0, (), (), deskewed)
+    monkeypatch.setattr(import_dataset, "take", lambda *_, **__: summary)
+    assert run("rosbag", *options) == 0
+    assert f"corrected for the vehicle's motion: {line}" in capsys.readouterr().out.splitlines()
+
+
 def test_scans_from_images_need_the_camera_without_images_too(calls: list[Any]) -> None:
     assert run("tum-rgbd", "--camera", "camera.json", "--no-pictures") == 0
 
