@@ -16,7 +16,7 @@ from model_training.cli.queries_table import print_queries
 from model_training.cli.stages_table import print_stages
 from model_training.datasets.dataset import Dataset, require_map_first
 from model_training.evaluation.evaluate import evaluate, write_trajectory
-from model_training.evaluation.measures import recall_at
+from model_training.evaluation.measures import label_of, recall_at
 from model_training.evaluation.predict import Predictions
 from model_training.evaluation.query_mode import MOST_FRAMES, QueryMode
 from model_training.evaluation.raw_range import raw_best_views
@@ -277,7 +277,7 @@ def _table(figures: dict[str, Any]) -> Table:
     for key, label, form in SHOWN:
         cells = [_cell(values, key, form) for _, values in columns]
         if any(cell != "-" for cell in cells):
-            table.add_row(label, *cells)
+            table.add_row(label_of(key, label, registered=figures["registered"]), *cells)
     if "raw" in figures:
         table.add_row("raw range image's setting", *(v["raw"]["best_setting"] for _, v in columns))
     return table

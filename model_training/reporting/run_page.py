@@ -7,6 +7,7 @@ from typing import Any
 
 from model_training.datasets.dataset import Dataset
 from model_training.evaluation.failures import WHY, Stage, position_errors, stages, worst
+from model_training.evaluation.measures import label_of
 from model_training.evaluation.predict import Predictions, joined
 from model_training.evaluation.saved_run import SavedRun
 from model_training.evaluation.why_refused import FEW, NO_CAUSE
@@ -92,7 +93,10 @@ def _lead(run: SavedRun, figures: dict[str, Any]) -> str:
 def _figures(figures: dict[str, Any]) -> str:
     columns = _columns(figures)
     rows = [
-        [escape(label), *(_share(values, key) for values in columns.values())]
+        [
+            escape(label_of(key, label, registered=figures["registered"])),
+            *(_share(values, key) for values in columns.values()),
+        ]
         for key, label in _SHARES
         if figures.get(key) is not None
     ]
@@ -127,6 +131,7 @@ def _share(values: dict[str, Any], key: str) -> str:
 
 def _conditions(run: SavedRun, figures: dict[str, Any]) -> str:
     sets = figures["sets"]
+    recall = label_of("recall_at_1_5m", "R@1 at 5 m", registered=figures["registered"])
     rows = [
         [
             f"{k}. {escape(each.name)}",
@@ -141,11 +146,11 @@ def _conditions(run: SavedRun, figures: dict[str, Any]) -> str:
             side_by_side({name: (values[key], *values["ci95"][key]) for name, values in sets.items()}, label),
             f"{label}, with 95 % intervals.",
         )
-        for key, label in (("within_1_m", "within 1 m"), ("recall_at_1_5m", "R@1 at 5 m"))
+        for key, label in (("within_1_m", "within 1 m"), ("recall_at_1_5m", recall))
     ]
     return table(
         "Each query set with weather and light, and how its queries relate to the survey.",
-        ["set", "condition", "split", "answered", "within 1 m", "R@1 at 5 m"],
+        ["set", "condition", "split", "answered", "within 1 m", recall],
         rows,
     ) + _pair(drawn)
 

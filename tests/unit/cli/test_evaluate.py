@@ -138,11 +138,21 @@ def test_forced_figures_stand_beside_accepted_ones_and_every_error_has_its_statu
         "accepted, within 1 m",
         "forced, within 1 m",
         "accepted, over 1 m off",
+        "R@1 at 5 m, after registration",
         "drive1_precise: the 2 worst of 5 queries",
     ):
         assert label in told
     listed = told.split("the 2 worst of 5 queries")[1].splitlines()
     assert sum("LOCALIZED" in line and line.rstrip().endswith("°") for line in listed) == 2
+
+
+def test_recall_of_retrieval_alone_is_not_called_registered(
+    small_dataset: Dataset, small_map: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run("evaluate", small_map, small_dataset.folder, "--no-refine", "--report", tmp_path / "page") == 0
+    for told in (capsys.readouterr().out, (tmp_path / "page" / "index.html").read_text()):
+        assert "R@1 at 5 m" in told
+        assert "after registration" not in told
 
 
 def test_a_dataset_in_the_place_of_the_map_is_named(
