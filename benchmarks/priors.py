@@ -5,9 +5,10 @@ from numpy.typing import NDArray
 
 from benchmarks.plans import BOTH, unseen_plan
 from benchmarks.report import Report
-from benchmarks.runs import Runs, accepted_within, prior_with_std, within
+from benchmarks.runs import Runs, accepted_within, within
 from benchmarks.sequences import between_landmarks, repeating_answers
 from model_training.evaluation.predict import Predictions, PriorOf
+from model_training.evaluation.priors import prior_with_std
 from model_training.simulation.repeating import BLOCK_M
 from service.geometry.rigid import Transform
 from service.retrieval.prior import Prior

@@ -25,12 +25,10 @@ from model_training.mapping.settings import BuildSettings
 from model_training.simulation.plan import SimulationPlan
 from model_training.simulation.simulate import simulate
 from model_training.stock import CALIBRATION
-from service.geometry.rigid import Transform
 from service.localization.localizer import Localizer
 from service.maps.map import Map
 from service.maps.reader import MapBundle
 from service.retrieval.encoder import Encoder
-from service.retrieval.prior import Prior
 
 #: Only each third query of a set is given to the raw image. It is slow, and a third of the queries suffices to
 #: distinguish 0.3 from 0.4.
@@ -206,19 +204,6 @@ class Runs:
                 counts[setting] = (int(right.sum()), len(truth))
             kept.write_text(json.dumps(counts))
         return {setting: (right, count) for setting, (right, count) in json.loads(kept.read_text()).items()}
-
-
-def prior_with_std(std_m: float) -> PriorOf:
-    """Return a function that makes priors of a position. Their error agrees with the standard deviation that they state.
-
-    Args:
-        std_m: standard deviation per axis, metres.
-    """
-
-    def prior(T_map_camera: Transform, rng: np.random.Generator) -> Prior:
-        return Prior(position_m=T_map_camera[:2, 3] + rng.normal(0, std_m, 2), position_std_m=std_m)
-
-    return prior
 
 
 def within(predictions: Predictions, reach_m: float) -> NDArray[np.bool_]:

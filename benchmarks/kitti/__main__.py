@@ -56,6 +56,8 @@ def main() -> None:
     drives = drives_below(arguments.root)
     for line in missing(drives):
         print(f"missing: {line}", flush=True)
+    if arguments.only:
+        _require_known(parser, arguments.only, [drive.name for drive in drives])
     chosen = [drive for drive in drives if not arguments.only or drive.name in arguments.only]
     for line in left_out(drives, chosen):
         print(f"left out: {line}", flush=True)
@@ -79,6 +81,13 @@ def main() -> None:
     report.notes["left_out"] = left_out(drives, chosen) or None
     report.notes[NOTE] = {name: list(row) for name, row in PUBLISHED_R1.items()}
     print(report.write())
+
+
+def _require_known(parser: argparse.ArgumentParser, only: list[str], known: list[str]) -> None:
+    """End the program if a name is that of no drive below the folder."""
+    unknown = [name for name in only if name not in known]
+    if unknown:
+        parser.error(f"--only: no drive {', '.join(unknown)} below --root; choose among: {', '.join(known) or 'none'}")
 
 
 def _mapped(drive: Drive, root: Path, work: Path) -> tuple[Dataset, MapBundle]:

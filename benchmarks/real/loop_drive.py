@@ -37,6 +37,7 @@ class LoopDrive:
     georeference: dict[str, Any] | None = None
     lidar = LidarSensor(name="paper_32", channels=32)
     notes = Notes()
+    has_images = False
 
     def __init__(self, seed: int, *, length_m: float, step_m: float = 1.0) -> None:
         self._city = City(seed=seed)

@@ -27,13 +27,13 @@ from benchmarks.real.stereo_frames import NAME as STEREO
 from benchmarks.real.stereo_frames import QUERIES as STEREO_QUERIES
 from benchmarks.real.stereo_frames import stereo_frames
 from benchmarks.report import Report
-from benchmarks.runs import prior_with_std
 from model_training.datasets.dataset import Dataset
 from model_training.evaluation.failures import position_errors
 from model_training.evaluation.measures import recall_at
 from model_training.evaluation.odometry import as_query
 from model_training.evaluation.pose_errors import pose_errors
 from model_training.evaluation.predict import RANKED, Predictions, headings_of, predict
+from model_training.evaluation.priors import prior_with_std
 from model_training.evaluation.stages import QueryStages, stages_of
 from model_training.evaluation.tracks import followed, steps_of
 from model_training.importing.kinds import OpenSettings, open_recording

@@ -14,11 +14,12 @@ import numpy as np
 
 from benchmarks.plans import BOTH
 from benchmarks.report import ROOT, Report
-from benchmarks.runs import MAPPING, Runs, accepted_within, code_hash, pooled, prior_with_std, share, within
+from benchmarks.runs import MAPPING, Runs, accepted_within, code_hash, pooled, share, within
 from benchmarks.serving.machines import Server, peak_mib
 from benchmarks.serving.sizes import STARTS
 from model_training.datasets.dataset import Dataset, QueryFrame
 from model_training.evaluation.measures import measure
+from model_training.evaluation.priors import prior_with_std
 from model_training.simulation.plan import QueryPlan, SimulationPlan
 from model_training.training.recipe import EVALUATION_SEEDS
 from service.client import Client

@@ -30,6 +30,7 @@ from service.errors import BundleError, DatasetError
 from service.localization.localizer import Localizer
 from service.maps.calibration import Calibration, RigCorrection
 from service.maps.map import Map
+from service.maps.rig_key import RigKey
 from service.maps.tiles import MOST_AROUND, TiledMap, open_map
 from service.maps.writer import replace_calibration
 from service.option_limits import LEAST_FALSE_ACCEPT_RATE
@@ -288,7 +289,34 @@ def _change_lines(calibration: Calibration, correction: RigCorrection) -> list[s
             f"kept: a correction of an earlier release ({calibration.rig.measured_on}); it applies to every camera without a correction of "
             "its own"
         )
-    return lines
+    return lines + [
+        _near_line(each, correction) for each in calibration.rigs if _differs_in_depth_only(each, correction)
+    ]
+
+
+def _differs_in_depth_only(one: RigCorrection, other: RigCorrection) -> bool:
+    """Check whether two corrections are for the same camera, and their baseline or range limit tells them apart."""
+    if one.made_for is None or other.made_for is None or one.made_for.is_same(other.made_for):
+        return False
+    a, b = (key.model_copy(update={"baseline_m": None, "max_range_m": None}) for key in (one.made_for, other.made_for))
+    return a.is_same(b)
+
+
+def _near_line(kept: RigCorrection, correction: RigCorrection) -> str:
+    """Return the warning that two corrections are for the same camera."""
+    theirs, ours = (_depth_of(each.made_for) for each in (kept, correction) if each.made_for is not None)
+    return (
+        f"warning: the kept correction {kept.name} is for the same camera with {theirs}; this one is for {ours}. A query gets the one "
+        "whose values it states. If the robot states others than this recording, import it again with its baseline (--baseline-m), and "
+        "calibrate again"
+    )
+
+
+def _depth_of(key: RigKey) -> str:
+    """Describe what a rig states about its depth."""
+    baseline = "no baseline" if key.baseline_m is None else f"baseline {key.baseline_m:g} m"
+    limit = "no range limit" if key.max_range_m is None else f"range limit {key.max_range_m:g} m"
+    return f"{baseline} and {limit}"
 
 
 def part_for(opened: Map, source: Dataset | RigFile, queries: Sequence[str] = ()) -> Map:

@@ -45,6 +45,8 @@ def command(
         part = json_file.with_name(json_file.name + ".part")
         part.write_text(json.dumps(found.as_json(), indent=1) + "\n")
         part.rename(json_file)
+    for name, mode in zip("AB", found.modes, strict=True):
+        console.print(f"{name}: {mode}", highlight=False)
     Console().print(_table(found))
     console.print(_errors(found), highlight=False)
     console.print(found.verdict, highlight=False)

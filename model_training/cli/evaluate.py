@@ -1,6 +1,7 @@
 """``streetfix evaluate``."""
 
 import json
+from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -15,12 +16,13 @@ from model_training.cli.queries_table import print_queries
 from model_training.cli.stages_table import print_stages
 from model_training.datasets.dataset import Dataset, require_map_first
 from model_training.evaluation.evaluate import evaluate, write_trajectory
-from model_training.evaluation.measures import recall_at
+from model_training.evaluation.measures import label_of, recall_at
 from model_training.evaluation.predict import Predictions
+from model_training.evaluation.query_mode import MOST_FRAMES, QueryMode
 from model_training.evaluation.raw_range import raw_best_views
 from model_training.evaluation.saved_run import save_run
 from model_training.evaluation.stages import stages_of
-from model_training.evaluation.why_refused import FEW, causes
+from model_training.evaluation.why_refused import FEW, NO_CAUSE, causes
 from service.errors import DatasetError
 from service.localization.localizer import Localizer
 from service.maps.map import Map
@@ -28,6 +30,7 @@ from service.maps.tiles import open_map
 
 SHOWN = (
     ("queries", "queries", "{:d}"),
+    ("odometry", "relative poses", "{}"),
     ("localized", "accepted", "{:.2%}"),
     ("accepted_wrong", "accepted, over 1 m off", "{:.2%}"),
     ("median_confidence", "median confidence", "{:.3f}"),
@@ -97,7 +100,33 @@ def command(
             "--refine/--no-refine", help="Register each query on the map cloud. --no-refine measures retrieval alone."
         ),
     ] = True,
-    workers: Annotated[int, typer.Option(help="Queries that run at a time.", min=1)] = 2,
+    frames: Annotated[
+        int | None,
+        typer.Option(
+            help="Consecutive images in one query, as a sequence of the API. The relative poses come from odometry.txt of the set, else "
+            "from the ground truth, with simulated errors of an odometry.  [default: 1]",
+            min=1,
+            max=MOST_FRAMES,
+        ),
+    ] = None,
+    prior_std_m: Annotated[
+        float | None,
+        typer.Option(
+            help="Give each query a prior position. Its standard deviation per axis, and that of its error from the true position, are "
+            "this number of metres. With --track, only the first image has a prior.  [default: no prior]",
+            min=0.01,
+        ),
+    ] = None,
+    track: Annotated[
+        bool,
+        typer.Option(
+            "--track",
+            help="The images of a set are those of one moving robot, and each answer uses the images before. Odometry as for --frames.",
+        ),
+    ] = False,
+    workers: Annotated[
+        int | None, typer.Option(help="Queries that run at a time. Not with --track.  [default: 2]", min=1)
+    ] = None,
 ) -> None:
     """Measure the answers of a map against ground truth.
 
@@ -105,7 +134,11 @@ def command(
     Examples:
       streetfix evaluate maps/paper-city data/paper --queries drive1_precise --json result.json
       streetfix evaluate maps/paper-city data/paper --report reports/paper
+      streetfix evaluate maps/town data/robot --frames 5
+      streetfix evaluate maps/town data/robot --track --prior-std-m 3
     """
+    mode = _mode(frames, prior_std_m, track=track)
+    _refuse_without_effect(mode, raw_baseline=raw_baseline, stages=stages, refine=refine, workers=workers)
     if report_folder is not None:
         # Only a report needs matplotlib, and its import takes longer than that of all others. It must not fail after the run.
         from model_training.reporting.run_page import write_run_page
@@ -121,7 +154,7 @@ def command(
         if file is not None:
             file.parent.mkdir(parents=True, exist_ok=True)
     with bars() as report:
-        result = evaluate(opened, data, names, refine=refine, workers=workers, report=report)
+        result = evaluate(opened, data, names, mode=mode, refine=refine, workers=workers or 2, report=report)
         figures = result.figures
         if raw_baseline:
             places = raw_best_views(opened, data, list(result.predictions), report=report)
@@ -129,6 +162,7 @@ def command(
         traced = (
             {name: stages_of(Localizer.open(opened), data, name, report=report) for name in names} if stages else {}
         )
+    _add_causes(figures, opened, data, result.predictions)
     if stages:
         figures["stages"] = {name: [each.as_json() for each in found] for name, found in traced.items()}
     if trajectory is not None:
@@ -144,13 +178,38 @@ def command(
         part.write_text(json.dumps(figures, indent=1) + "\n")
         part.rename(json_file)
     Console().print(_table(figures))
-    _say_why(opened, data, result.predictions)
+    _say_why(figures)
     for name, answers in result.predictions.items():
-        print_queries(name, answers, Console(), most=most)
+        print_queries(name, answers, Console(), most=most, first_image=mode.frames - 1)
     for name, found in traced.items():
         print_stages(name, found, Console())
     if report_folder is not None:
         Console(soft_wrap=True).print(f"report: {page}")
+
+
+def _mode(frames: int | None, prior_std_m: float | None, *, track: bool) -> QueryMode:
+    if track and frames is not None:
+        raise typer.BadParameter(
+            "--frames and --track exclude each other: a track chooses how many images it uses together"
+        )
+    return QueryMode(frames=frames or 1, prior_std_m=prior_std_m, track=track)
+
+
+def _refuse_without_effect(
+    mode: QueryMode, *, raw_baseline: bool, stages: bool, refine: bool, workers: int | None
+) -> None:
+    """Refuse options that the mode cannot use."""
+    if mode.track and workers is not None:
+        raise typer.BadParameter("--workers and --track exclude each other: the images of a track follow one another")
+    if mode.track and not refine:
+        raise typer.BadParameter("--no-refine and --track exclude each other: a track needs registered images")
+    named = "--track" if mode.track else "--frames" if mode.frames > 1 else "--prior-std-m"
+    if mode == QueryMode():
+        return
+    if stages:
+        raise typer.BadParameter(f"--stages examines single images without a prior; leave out --stages or {named}")
+    if raw_baseline and mode.frames > 1:
+        raise typer.BadParameter("--raw-baseline compares single images; leave out --raw-baseline or --frames")
 
 
 def _add_raw(
@@ -180,31 +239,37 @@ def _raw_figures(right: dict[str, NDArray[np.bool_]], queries: slice) -> dict[st
     return {"raw_recall_at_1_5m": recalls[best], "raw": {"best_setting": best, "recall_at_1_5m": recalls}}
 
 
-def _say_why(bundle: Map, data: Dataset, predictions: dict[str, Predictions]) -> None:
-    """Print what to check if few answers were accepted or the focal length is suspicious, the likeliest cause first."""
-    console = Console(soft_wrap=True, highlight=False)
+def _add_causes(figures: dict[str, Any], bundle: Map, data: Dataset, predictions: dict[str, Predictions]) -> None:
+    """Add what to check to the figures of each set, if few answers were accepted or the focal length is suspicious, the likeliest first."""
+    if bundle.calibration is None:
+        return
     for name, answers in predictions.items():
-        if bundle.calibration is None:
-            continue
         found = causes(Localizer.open(bundle), list(data.queries(name)), answers)
-        if answers.localized.mean() >= FEW and not found:
+        figures["sets"][name]["causes"] = [asdict(cause) for cause in found]
+
+
+def _say_why(figures: dict[str, Any]) -> None:
+    """Print what to check in each set, the likeliest cause first."""
+    console = Console(soft_wrap=True, highlight=False)
+    for name, values in figures["sets"].items():
+        found = values.get("causes")
+        if found is None or (values["localized"] >= FEW and not found):
             continue
         console.print(
-            f"{name}: {answers.localized.mean():.0%} of the answers are accepted. What to check, the likeliest first:"
+            f"{name}: {values['localized']:.0%} of the answers are accepted. What to check, the likeliest first:"
         )
         for number, cause in enumerate(found, 1):
-            console.print(f"  {number}. {cause}")
+            console.print(f"  {number}. {cause['what']}: {cause['check']}")
         if not found:
-            console.print(
-                "  All confidence features are in the range of the calibration data. The place may be outside the map "
-                "or a perceptual alias."
-            )
+            console.print(f"  {NO_CAUSE}")
 
 
 def _table(figures: dict[str, Any]) -> Table:
-    table = Table(
-        caption=_CAPTION, title=f"{figures['dataset']} on map {figures['map']['name']} {figures['map']['version']}"
-    )
+    title = f"{figures['dataset']} on map {figures['map']['name']} {figures['map']['version']}"
+    mode = QueryMode.model_validate(figures["mode"])
+    if mode != QueryMode():
+        title += f"\n{mode.described()}"
+    table = Table(caption=_CAPTION, title=title)
     columns = [("all", figures), *figures["sets"].items()] if len(figures["sets"]) > 1 else [*figures["sets"].items()]
     table.add_column("")
     for name, values in columns:
@@ -212,7 +277,7 @@ def _table(figures: dict[str, Any]) -> Table:
     for key, label, form in SHOWN:
         cells = [_cell(values, key, form) for _, values in columns]
         if any(cell != "-" for cell in cells):
-            table.add_row(label, *cells)
+            table.add_row(label_of(key, label, registered=figures["registered"]), *cells)
     if "raw" in figures:
         table.add_row("raw range image's setting", *(v["raw"]["best_setting"] for _, v in columns))
     return table

@@ -10,7 +10,7 @@ from model_training.evaluation.failures import position_errors, worst
 from model_training.evaluation.predict import Predictions, headings_of
 
 
-def print_queries(name: str, answers: Predictions, console: Console, *, most: int) -> None:
+def print_queries(name: str, answers: Predictions, console: Console, *, most: int, first_image: int = 0) -> None:
     """Print the worst answers of a query set: accepted and wrong first, then the others by distance.
 
     Args:
@@ -18,6 +18,7 @@ def print_queries(name: str, answers: Predictions, console: Console, *, most: in
         answers: answers to all of its queries.
         console: destination.
         most: largest number of rows; 0 prints nothing.
+        first_image: number of the image whose pose the first query asks for.
     """
     if most == 0:
         return
@@ -37,7 +38,7 @@ def print_queries(name: str, answers: Predictions, console: Console, *, most: in
     for row in rows:
         confidence = answers.confidence[row]
         table.add_row(
-            str(row),
+            str(row + first_image),
             str(answers.status[row]) or "refused",
             f"{confidence:.3f}" if math.isfinite(confidence) else "-",
             f"{errors[row]:.2f} m" if math.isfinite(errors[row]) else "-",

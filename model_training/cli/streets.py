@@ -105,7 +105,8 @@ def _read(
     if georeference is None and (frame == "wgs84" or kind == "osm"):
         raise DatasetError(
             f"{dataset.folder}/dataset.json: georeference is null, so WGS-84 coordinates have no position in its map; "
-            "import the survey with its georeference" + ("" if kind == "osm" else ", or give --frame map"),
+            "import the survey with `streetfix import --georeference LAT,LON`"
+            + ("" if kind == "osm" else ", or give --frame map"),
             field="georeference",
         )
     if kind == "osm" and frame == "map":

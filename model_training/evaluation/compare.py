@@ -30,6 +30,7 @@ class Comparison:
         errors: comparison of the distances of answers that both runs have, accepted or not. None if there are none.
         gained: rows of the joined sets for which only B is within 1 m and accepted.
         lost: rows for which only A is.
+        modes: how the images became queries in A and in B, as text.
         first: answers of A, all sets joined.
         second: answers of B, all sets joined.
     """
@@ -39,6 +40,7 @@ class Comparison:
     errors: PairedErrors | None
     gained: list[int]
     lost: list[int]
+    modes: tuple[str, str]
     first: Predictions
     second: Predictions
 
@@ -73,6 +75,7 @@ class Comparison:
         """Return all figures as JSON values."""
         return {
             "verdict": self.verdict,
+            "modes": list(self.modes),
             "shares": {name: asdict(each) | {"difference": each.difference} for name, each in self.shares.items()},
             "sets": {name: asdict(each) | {"difference": each.difference} for name, each in self.sets.items()},
             "errors": None if self.errors is None else asdict(self.errors),
@@ -126,6 +129,7 @@ def compare(first: SavedRun, second: SavedRun) -> Comparison:
         errors=paired_errors(position_errors(a), position_errors(b)),
         gained=[int(k) for k in np.flatnonzero(right_b & ~right_a)],
         lost=[int(k) for k in np.flatnonzero(right_a & ~right_b)],
+        modes=(first.settings.described(), second.settings.described()),
         first=a,
         second=b,
     )
@@ -148,6 +152,12 @@ def _flags(a: Predictions, b: Predictions) -> Iterator[tuple[str, NDArray[np.boo
 
 
 def _require_same_queries(first: SavedRun, second: SavedRun) -> None:
+    if first.settings.mode.frames != second.settings.mode.frames:
+        raise DatasetError(
+            f"{first.folder} measured {first.settings.mode.described()}, and {second.folder} {second.settings.mode.described()}, so they "
+            "have different queries; evaluate both with the same --frames",
+            field="frames",
+        )
     names, others = set(first.predictions), set(second.predictions)
     if names != others:
         alone = ", ".join(sorted(names ^ others))

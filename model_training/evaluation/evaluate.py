@@ -9,7 +9,8 @@ import numpy as np
 
 from model_training.datasets.dataset import Dataset, write_tum
 from model_training.evaluation.measures import measure
-from model_training.evaluation.predict import Predictions, joined, predict
+from model_training.evaluation.predict import Predictions, joined
+from model_training.evaluation.query_mode import SINGLE, QueryMode, predict_in_mode
 from service.errors import DatasetError
 from service.localization.localizer import Localizer
 from service.maps.map import Map
@@ -36,6 +37,7 @@ def evaluate(
     dataset: Dataset,
     names: list[str] | None = None,
     *,
+    mode: QueryMode = SINGLE,
     refine: bool = True,
     workers: int = 2,
     report: Report = lambda *_: None,
@@ -48,12 +50,13 @@ def evaluate(
         bundle: the map.
         dataset: the dataset with the queries. If it has another georeference than the map, it is moved into the frame of the map.
         names: names of the query sets; None takes all sets with ground truth.
+        mode: how the images become queries. ``figures["mode"]`` has it, and ``odometry`` of a set says where relative poses come from.
         refine: register the answers. False measures retrieval alone.
         workers: number of queries that are localized at the same time.
         report: called after every query.
 
     Raises:
-        DatasetError: there is no query set with ground truth.
+        DatasetError: there is no query set with ground truth, or a set does not fit the mode.
     """
     dataset = dataset.in_frame(bundle.manifest.georeference)
     names = names or dataset.query_sets(with_truth=True)
@@ -63,13 +66,16 @@ def evaluate(
         )
     localizer = Localizer.open(bundle)
     classes = [] if bundle.streets is None else [street.name for street in bundle.streets.features]
-    predictions = {
-        name: predict(localizer, dataset, name, refine=refine, workers=workers, report=report) for name in names
-    }
+    predictions, odometry = dict[str, Predictions](), dict[str, str | None]()
+    for name in names:
+        predictions[name], odometry[name] = predict_in_mode(
+            localizer, dataset, name, mode, refine=refine, workers=workers, report=report
+        )
     figures = measure(joined(list(predictions.values())), classes)
     seen = city_seen_in_training(dataset, localizer.encoder.trained_on)
     sets = {
-        name: {"split": split_of(dataset, name, seen), "city_seen_in_training": seen} | measure(p, classes)
+        name: {"split": split_of(dataset, name, seen), "city_seen_in_training": seen, "odometry": odometry[name]}
+        | measure(p, classes)
         for name, p in predictions.items()
     }
     splits = sorted({str(s["split"]) for s in sets.values()})
@@ -79,6 +85,7 @@ def evaluate(
         "split": splits[0] if len(splits) == 1 else "mixed",
         "encoder_sha256": bundle.manifest.encoder_sha256,
         "registered": refine and bundle.cloud is not None,
+        "mode": mode.model_dump(),
     }
     return Evaluation(head | figures | {"sets": sets}, predictions)
 

@@ -40,6 +40,17 @@ def recall_at(
     return np.asarray((np.nan_to_num(distance, nan=np.inf) <= within_m).any(axis=1))
 
 
+def label_of(key: str, label: str, *, registered: bool) -> str:
+    """Return the label of a figure for readers. Registration sorts the retrieved places again, so the label of a recall says it.
+
+    Args:
+        key: name of the figure.
+        label: its label without registration.
+        registered: whether the answers were registered.
+    """
+    return f"{label}, after registration" if registered and key.startswith("recall_at") else label
+
+
 def measure(predictions: Predictions, street_names: list[str]) -> dict[str, Any]:
     """Compute all figures of one query set as JSON values; ``ci95`` holds Wilson intervals of the shares.
 

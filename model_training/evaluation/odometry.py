@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from model_training.datasets.dataset import QueryFrame
+from model_training.datasets.dataset import QueryFrame, Transforms
 from service.geometry.rigid import Transform, inverse, rotation_y, transform_from
 from service.imaging.view_grid import ViewGrid
 from service.retrieval.query import Query
@@ -37,6 +37,7 @@ def as_query(
     ranked: int,
     refine: bool = True,
     exact: bool = False,
+    T_odom_camera: Transforms | None = None,
 ) -> tuple[tuple[Query, ...], tuple[Transform, ...]]:
     """Return the queries of a sequence, the last frame first, and the pose of each camera in the last camera's frame (4, 4).
 
@@ -47,11 +48,14 @@ def as_query(
         ranked: number of distinct places in the answer.
         refine: register the answer.
         exact: take the odometry from the true poses, without errors.
+        T_odom_camera: recorded odometry of the frames (n, 4, 4), metres, instead of the true poses.
     """
     queries, poses, T_last_this = [], [], np.eye(4)
     for k in range(len(frames) - 1, -1, -1):
         frame, later = frames[k], frames[k + 1] if k + 1 < len(frames) else None
-        if later is not None and frame.T_map_camera is not None and later.T_map_camera is not None:
+        if T_odom_camera is not None:
+            T_last_this = inverse(T_odom_camera[-1]) @ T_odom_camera[k]
+        elif later is not None and frame.T_map_camera is not None and later.T_map_camera is not None:
             T_last_this = T_last_this @ odometry_between(later.T_map_camera, frame.T_map_camera, None if exact else rng)
         queries.append(replace(frame.query(grid), ranked=ranked, refine=refine))
         poses.append(T_last_this)

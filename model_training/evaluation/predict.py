@@ -1,7 +1,7 @@
 """Pass 1 of an evaluation: store the answers of a map to every query of a set. New measures then need no new run."""
 
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from itertools import islice
@@ -11,7 +11,7 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from model_training.datasets.dataset import Dataset, QueryFrame
+from model_training.datasets.dataset import Dataset, QueryFrame, Transforms
 from model_training.evaluation.odometry import as_query
 from service.confidence.features import FEATURES
 from service.errors import DatasetError, NoDepthError
@@ -168,6 +168,24 @@ def predict(
     Raises:
         DatasetError: the set has no ground truth or no frames.
     """
+    frames = frames_with_truth(dataset, name)
+    groups = [frames[k : k + frames_each] for k in range(0, len(frames), frames_each)]
+    answers = answers_to(
+        localizer, name, groups, refine=refine, workers=workers, prior_of=prior_of, seen_by=seen_by, report=report
+    )
+    return predictions_of(localizer, [group[-1] for group in groups], answers)
+
+
+def frames_with_truth(dataset: Dataset, name: str) -> list[QueryFrame]:
+    """Return the images of a query set.
+
+    Args:
+        dataset: the dataset.
+        name: name of the query set.
+
+    Raises:
+        DatasetError: the set has no ground truth or no images.
+    """
     frames = list(dataset.queries(name))
     if not frames or frames[0].T_map_camera is None:
         raise DatasetError(
@@ -175,21 +193,48 @@ def predict(
             "add the images and poses.txt (TUM format), or choose another query set",
             field="queries",
         )
-    groups = [frames[k : k + frames_each] for k in range(0, len(frames), frames_each)]
+    return frames
+
+
+def answers_to(
+    localizer: Localizer,
+    name: str,
+    groups: Sequence[list[QueryFrame]],
+    odometry: Sequence[Transforms] | None = None,
+    *,
+    refine: bool = True,
+    workers: int = 2,
+    prior_of: PriorOf | None = None,
+    seen_by: SeenBy | None = None,
+    report: Report = lambda *_: None,
+) -> list[tuple[Answer | None, float]]:
+    """Localize groups of images, each group as one query. It asks for the pose of its last image.
+
+    Args:
+        localizer: the localizer of the map.
+        name: name of the query set, for the report.
+        groups: the images of each query, in the order of the traversal.
+        odometry: T_odom_camera of the images of each query (k, 4, 4), metres; None for the true poses with errors.
+        refine: register the answers. False answers by retrieval alone.
+        workers: number of queries that are localized at the same time.
+        prior_of: returns the prior of each query; None for no prior.
+        seen_by: changes each query to another camera rig; None keeps the rig.
+        report: called after every query.
+
+    Returns:
+        The answer to each query and its duration in milliseconds. The answer is None if an image has no depth.
+    """
+
+    def ask(number: int) -> tuple[Answer | None, float]:
+        T_odom_camera = None if odometry is None else odometry[number]
+        return _ask(localizer, groups[number], number, T_odom_camera, refine=refine, prior_of=prior_of, seen_by=seen_by)
+
     answers: list[tuple[Answer | None, float]] = []
     with ThreadPoolExecutor(workers) as pool:
-        for done, answer in enumerate(
-            in_order(
-                pool,
-                lambda k: _ask(localizer, groups[k], k, refine=refine, prior_of=prior_of, seen_by=seen_by),
-                range(len(groups)),
-                ahead=4 * workers,
-            ),
-            1,
-        ):
+        for done, answer in enumerate(in_order(pool, ask, range(len(groups)), ahead=4 * workers), 1):
             answers.append(answer)
             report(f"queries {name}", done, len(groups))
-    return _table(localizer, [group[-1] for group in groups], answers)
+    return answers
 
 
 def in_order(pool: ThreadPoolExecutor, work: Callable[[T], R], items: Iterable[T], *, ahead: int) -> Iterator[R]:
@@ -212,6 +257,7 @@ def _ask(
     localizer: Localizer,
     frames: list[QueryFrame],
     number: int,
+    T_odom_camera: Transforms | None,
     *,
     refine: bool,
     prior_of: PriorOf | None,
@@ -219,7 +265,12 @@ def _ask(
 ) -> tuple[Answer | None, float]:
     began = time.perf_counter()
     queries, poses = as_query(
-        frames, np.random.default_rng([77, number]), grid=localizer.bundle.grid, ranked=RANKED, refine=refine
+        frames,
+        np.random.default_rng([77, number]),
+        grid=localizer.bundle.grid,
+        ranked=RANKED,
+        refine=refine,
+        T_odom_camera=T_odom_camera,
     )
     T_map_camera = frames[-1].T_map_camera
     if prior_of is not None and T_map_camera is not None:
@@ -234,7 +285,16 @@ def _ask(
     return answer, 1e3 * (time.perf_counter() - began)
 
 
-def _table(localizer: Localizer, frames: list[QueryFrame], answers: list[tuple[Answer | None, float]]) -> Predictions:
+def predictions_of(
+    localizer: Localizer, frames: Sequence[QueryFrame], answers: Sequence[tuple[Answer | None, float]]
+) -> Predictions:
+    """Return answers beside their ground truth.
+
+    Args:
+        localizer: the localizer of the map.
+        frames: the image whose pose each query asks for, with its true pose.
+        answers: the answer to each query, None without depth, and its duration in milliseconds.
+    """
     count, streets = len(frames), localizer.bundle.streets
     T_true = np.array([frame.T_map_camera for frame in frames])
     T_answer, ranked = np.full((count, 4, 4), np.nan), np.full((count, RANKED, 2), np.nan)

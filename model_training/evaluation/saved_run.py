@@ -13,6 +13,7 @@ from pydantic import AwareDatetime, BaseModel, ConfigDict, Field, ValidationErro
 from model_training.datasets.dataset import Dataset
 from model_training.evaluation.evaluate import Evaluation
 from model_training.evaluation.predict import Predictions
+from model_training.evaluation.query_mode import SINGLE, QueryMode
 from service.errors import DatasetError
 from service.imaging.npy_header import NPY_HEADER_ERRORS
 from service.maps.map import Map
@@ -58,12 +59,14 @@ class RunSet(_Frozen):
         name: name of the set.
         split: the split that it belongs to, as from ``evaluate.split_of``.
         queries: number of queries.
+        odometry: where relative poses of the images come from; None if a query has one image and there is no track.
         condition: weather and light of a simulated set; None for others.
     """
 
     name: str = Field(pattern=r"^[^./\\][^/\\]*$")  # it becomes a file name
     split: str
     queries: int
+    odometry: str | None = None
     condition: str | None = None
 
 
@@ -75,6 +78,7 @@ class RunSettings(_Frozen):
         map: the map.
         dataset: the dataset of the queries.
         registered: whether the answers were registered, not only retrieved.
+        mode: how the images became queries. Runs of earlier releases have single images.
         sets: the query sets.
         streets: names of the map's streets, in the order of their features.
         streetfix: version of the package.
@@ -86,11 +90,17 @@ class RunSettings(_Frozen):
     map: RunMap
     dataset: RunData
     registered: bool
+    mode: QueryMode = SINGLE
     sets: tuple[RunSet, ...]
     streets: tuple[str, ...]
     streetfix: str
     commit: str | None
     made_at: AwareDatetime
+
+    def described(self) -> str:
+        """Return how the images became queries, and where their relative poses come from, as text for readers."""
+        sources = sorted({each.odometry for each in self.sets if each.odometry is not None})
+        return self.mode.described() + (f", relative poses from {' and '.join(sources)}" if sources else "")
 
 
 @dataclass(frozen=True)
@@ -163,6 +173,7 @@ def save_run(folder: Path, bundle: Map, dataset: Dataset, evaluation: Evaluation
             name=name,
             split=evaluation.figures["sets"][name]["split"],
             queries=len(p.T_true),
+            odometry=evaluation.figures["sets"][name]["odometry"],
             condition=conditions.get(name),
         )
         for name, p in evaluation.predictions.items()
@@ -171,6 +182,7 @@ def save_run(folder: Path, bundle: Map, dataset: Dataset, evaluation: Evaluation
         map=RunMap(name=bundle.name, version=bundle.manifest.version, path=str(bundle.path.resolve())),
         dataset=RunData(name=dataset.name, path=str(dataset.folder.resolve())),
         registered=evaluation.figures["registered"],
+        mode=QueryMode.model_validate(evaluation.figures["mode"]),
         sets=sets,
         streets=() if bundle.streets is None else tuple(street.name for street in bundle.streets.features),
         streetfix=version("streetfix"),

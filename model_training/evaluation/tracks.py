@@ -1,16 +1,19 @@
 """Follow simulated robots over their frames, with the errors of their odometry, and compare every answer with the ground truth."""
 
-from collections.abc import Callable, Sequence
+import time
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
 
-from model_training.datasets.dataset import Dataset, QueryFrame
+from model_training.datasets.dataset import Dataset, QueryFrame, Transforms
 from model_training.evaluation.odometry import odometry_between
+from model_training.evaluation.predict import PriorOf
 from service.errors import NoDepthError
-from service.geometry.rigid import Transform, transform_from
+from service.geometry.rigid import Transform, inverse, transform_from
+from service.localization.answer import Answer
 from service.localization.localizer import Localizer
 from service.localization.tracker import Track, follow
 
@@ -79,17 +82,54 @@ def drives_of(dataset: Dataset, name: str, frames_each: int) -> list[list[Step]]
     ]
 
 
-def steps_of(frames: Sequence[QueryFrame], rng: np.random.Generator) -> list[Step]:
-    """Return consecutive frames with noisy odometry between them.
+def steps_of(
+    frames: Sequence[QueryFrame], rng: np.random.Generator, T_odom_camera: Transforms | None = None
+) -> list[Step]:
+    """Return consecutive frames with odometry between them.
 
     Args:
         frames: frames with true poses.
         rng: random generator of the errors.
+        T_odom_camera: recorded odometry of the frames (n, 4, 4), metres; None for the true steps with errors.
     """
     steps = [Step(frames[0], None)]
-    for before, frame in pairwise(frames):
-        steps.append(Step(frame, odometry_between(_true(before), _true(frame), rng)))
+    for number, (before, frame) in enumerate(pairwise(frames)):
+        if T_odom_camera is None:
+            T_previous_camera = odometry_between(_true(before), _true(frame), rng)
+        else:
+            T_previous_camera = inverse(T_odom_camera[number]) @ T_odom_camera[number + 1]
+        steps.append(Step(frame, T_previous_camera))
     return steps
+
+
+def answers_on(
+    localizer: Localizer, drive: Sequence[Step], *, ranked: int = 0, prior_of: PriorOf | None = None
+) -> Iterator[tuple[Answer | None, Track, float]]:
+    """Yield for each step of a robot the answer, the track after it, and the duration in milliseconds.
+
+    Args:
+        localizer: of the map.
+        drive: the steps.
+        ranked: number of distinct places in an answer.
+        prior_of: returns the prior of the first image; None for no prior.
+
+    Yields:
+        The answer is None if the image has no depth. The track then begins again.
+    """
+    track = Track()
+    for number, step in enumerate(drive):
+        began = time.perf_counter()
+        query = replace(step.frame.query(localizer.bundle.grid), ranked=ranked)
+        if prior_of is not None and number == 0:
+            query = replace(query, prior=prior_of(_true(step.frame), np.random.default_rng(78)))
+        answer: Answer | None = None
+        try:
+            frame = localizer.encode_and_search(query)
+        except NoDepthError:
+            track = track.broken()
+        else:
+            answer, track = follow(localizer, frame, track, step.T_previous_camera)
+        yield answer, track, 1e3 * (time.perf_counter() - began)
 
 
 def displaced(drives: list[list[Step]], after: int, *, step_m: float) -> list[list[Step]]:
@@ -121,16 +161,11 @@ def followed(localizer: Localizer, drives: list[list[Step]], report: Report = la
     accepted, error_m = np.zeros(shape, np.bool_), np.full(shape, np.inf)
     epoch, frames = np.zeros(shape, np.int64), np.zeros(shape, np.int64)
     for row, drive in enumerate(drives):
-        track = Track()
-        for column, step in enumerate(drive):
-            try:
-                frame = localizer.encode_and_search(step.frame.query(localizer.bundle.grid))
-            except NoDepthError:
-                track = track.broken()
+        for column, (answer, track, _) in enumerate(answers_on(localizer, drive)):
+            if answer is None:
                 epoch[row, column] = track.epoch
                 continue
-            answer, track = follow(localizer, frame, track, step.T_previous_camera)
-            apart = answer.T_map_camera_guess[:2, 3] - _true(step.frame)[:2, 3]
+            apart = answer.T_map_camera_guess[:2, 3] - _true(drive[column].frame)[:2, 3]
             accepted[row, column] = answer.status == "LOCALIZED"
             error_m[row, column] = float(np.hypot(*apart))
             epoch[row, column], frames[row, column] = answer.epoch, answer.frames

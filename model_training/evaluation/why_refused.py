@@ -26,6 +26,8 @@ from service.retrieval.query import Query
 
 #: A map accepts almost no answer if it accepts less than this share of the queries.
 FEW = 0.25
+#: What to say if few answers are accepted and there is no cause.
+NO_CAUSE = "All confidence features are in the range of the calibration data. The place may be outside the map or a perceptual alias."
 #: Factors of depth to try.
 DEPTH_FACTORS = (0.001, 0.1, 10.0, 1000.0)
 #: Largest number of queries to try for each factor.
@@ -46,9 +48,6 @@ class Cause:
 
     what: str
     check: str
-
-    def __str__(self) -> str:
-        return f"{self.what}: {self.check}"
 
 
 def causes(localizer: Localizer, frames: Sequence[QueryFrame], answers: Predictions) -> list[Cause]:

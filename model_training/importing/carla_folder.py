@@ -150,6 +150,11 @@ class CarlaFolder:
         town = f" of {self.recording.town}" if self.recording.town else ""
         return Notes((f"{len(self.frames)} frames{town}",), {"path": self.path.name, "town": self.recording.town})
 
+    @property
+    def has_images(self) -> bool:
+        """Whether the recording has images."""
+        return self.recording.camera is not None
+
     def count(self) -> int:
         """Count one scan per frame, and one image per frame if there is a camera."""
         return len(self.frames) * (2 if self.recording.camera else 1)

@@ -47,6 +47,11 @@ class Clouds:
         kinds = sorted({path.suffix for path in self.files})
         return Notes((f"{len(self.files)} scans ({', '.join(kinds)})",), {"path": self.path.name})
 
+    @property
+    def has_images(self) -> bool:
+        """Whether the recording has images."""
+        return False
+
     def count(self) -> int:
         """Count the scans."""
         return len(self.files)

@@ -30,6 +30,7 @@ class OpenSettings:
         poses: TUM file of poses; scans in their own files take their times from it.
         pictures: whether images will be read.
         vertical_correction: correct the vertical angle of KITTI's HDL-64; False does not.
+        baseline_m: of the stereo rig that measured the recorded depth, metres; None if it is not known.
     """
 
     depth: DepthFrom = "recorded"
@@ -40,6 +41,7 @@ class OpenSettings:
     poses: Path | None = None
     pictures: bool = True
     vertical_correction: bool | None = None
+    baseline_m: float | None = None
 
     @property
     def kitti_vertical_deg(self) -> float:
@@ -54,7 +56,7 @@ class Kind:
     Attributes:
         open: its reader.
         depths: sources of depth that it offers.
-        takes: settings that concern only some formats, and this one.
+        takes: options of ``streetfix import`` that it uses, without dashes.
     """
 
     open: Callable[[Path, OpenSettings], Recording]
@@ -62,13 +64,14 @@ class Kind:
     takes: frozenset[str] = frozenset()
 
 
-#: Settings that concern only some formats, and their options on the command line.
+#: Settings of a reader that concern only some formats, and their options on the command line.
 _OPTIONS = {
     "topics": "topic",
     "extrinsics": "extrinsics",
     "camera": "camera",
     "rectified": "rectified",
     "vertical_correction": "vertical-correction",
+    "baseline_m": "baseline-m",
 }
 
 
@@ -100,8 +103,25 @@ def _refuse_what_does_not_apply(kind: str, settings: OpenSettings) -> None:
             f"depth: {kind} has no {settings.depth!r} depth; choose one of: {', '.join(known.depths)}", field="depth"
         )
     for field_name, option in _OPTIONS.items():
-        if field_name not in known.takes and getattr(settings, field_name) != getattr(unasked, field_name):
+        if option not in known.takes and getattr(settings, field_name) != getattr(unasked, field_name):
             raise DatasetError(f"{option}: {kind} does not support this option; omit it", field=option)
+    _refuse_baseline_without_its_depth(settings)
+
+
+def _refuse_baseline_without_its_depth(settings: OpenSettings) -> None:
+    """Refuse a baseline that no imported depth has, and one that is given twice."""
+    of_topic = "right_info" in settings.topics
+    if settings.baseline_m is None and not of_topic:
+        return
+    field_name = "topic" if settings.baseline_m is None else "baseline-m"
+    named = "topic right_info" if settings.baseline_m is None else f"baseline-m {settings.baseline_m:g}"
+    if settings.baseline_m is not None and of_topic:
+        raise DatasetError(f"{named}: the topic right_info gives a baseline too; give one of the two", field=field_name)
+    if not settings.pictures or settings.depth == "lidar":
+        cause = (
+            "--depth lidar takes the depth from the scans" if settings.pictures else "--no-pictures imports no depth"
+        )
+        raise DatasetError(f"{named}: {cause}, so there is no stereo depth; omit one of the two", field=field_name)
 
 
 def _kitti_raw(source: Path, settings: OpenSettings) -> Recording:
@@ -141,13 +161,13 @@ def _carla(source: Path, settings: OpenSettings) -> Recording:
 def _tum_rgbd(source: Path, settings: OpenSettings) -> Recording:
     from model_training.importing.rgbd_folder import open_tum_rgbd
 
-    return open_tum_rgbd(source, settings.camera)
+    return open_tum_rgbd(source, settings.camera, settings.baseline_m)
 
 
 def _open3d(source: Path, settings: OpenSettings) -> Recording:
     from model_training.importing.rgbd_folder import open_open3d
 
-    return open_open3d(source, settings.camera)
+    return open_open3d(source, settings.camera, settings.baseline_m)
 
 
 def _rosbag(source: Path, settings: OpenSettings) -> Recording:
@@ -161,6 +181,7 @@ def _rosbag(source: Path, settings: OpenSettings) -> Recording:
         rectified=settings.rectified,
         want_pictures=settings.pictures,
         want_depth=settings.depth == "recorded",
+        baseline_m=settings.baseline_m,
     )
     return RosBag(source, bag)
 
@@ -175,14 +196,25 @@ def _kitti_depth(depth: DepthFrom) -> Literal["none", "stored", "sgbm"]:
 
 
 _KITTI: tuple[DepthFrom, ...] = ("recorded", "stored", "sgbm", "lidar")
+#: Options of every drive: its poses and their frame, and the scans that the survey leaves out.
+_DRIVE = frozenset(
+    {"poses", "align", "odometry", "loops", "lidar-height", "hold-out", "hold-out-first", "georeference"}
+)
+#: Options of drives with images. Without images, each scan has a pose at its own time, so ``sync`` and ``tolerance`` have no effect.
+_FILMED = _DRIVE | {"pictures", "queries", "sync", "tolerance"}
+_RGBD = _FILMED | {"camera", "baseline-m"}
 #: All formats by name.
 KINDS: dict[str, Kind] = {
-    "kitti-raw": Kind(_kitti_raw, _KITTI, frozenset({"vertical_correction"})),
-    "kitti-odometry": Kind(_kitti_odometry, _KITTI, frozenset({"vertical_correction"})),
-    "kitti-360": Kind(_kitti_360, ("recorded", "sgbm", "lidar")),
-    "rosbag": Kind(_rosbag, ("recorded", "lidar"), frozenset({"topics", "extrinsics", "camera", "rectified"})),
-    "carla": Kind(_carla, ("recorded", "lidar")),
-    "clouds": Kind(_clouds, ("recorded",)),
-    "open3d": Kind(_open3d, ("recorded",), frozenset({"camera"})),
-    "tum-rgbd": Kind(_tum_rgbd, ("recorded",), frozenset({"camera"})),
+    "kitti-raw": Kind(_kitti_raw, _KITTI, _FILMED | {"depth", "deskew", "vertical-correction"}),
+    "kitti-odometry": Kind(_kitti_odometry, _KITTI, _FILMED | {"depth", "vertical-correction"}),
+    "kitti-360": Kind(_kitti_360, ("recorded", "sgbm", "lidar"), _FILMED | {"depth", "deskew"}),
+    "rosbag": Kind(
+        _rosbag,
+        ("recorded", "lidar"),
+        _FILMED | {"depth", "deskew", "topic", "extrinsics", "camera", "rectified", "baseline-m"},
+    ),
+    "carla": Kind(_carla, ("recorded", "lidar"), _FILMED | {"depth"}),
+    "clouds": Kind(_clouds, ("recorded",), _DRIVE),
+    "open3d": Kind(_open3d, ("recorded",), _RGBD),
+    "tum-rgbd": Kind(_tum_rgbd, ("recorded",), _RGBD),
 }

@@ -148,6 +148,11 @@ class KittiSequence:
         choices.append(f"lidar ({scans} scan{'s' * (scans != 1)})")
         return f"the choices of --depth are {', '.join(choices)}"
 
+    @property
+    def has_images(self) -> bool:
+        """Whether the recording has images."""
+        return any(frame.left is not None for frame in self.frames)
+
     def count(self) -> int:
         """Count the scans and the left images."""
         return sum((frame.scan is not None) + (frame.left is not None) for frame in self.frames)

@@ -21,6 +21,11 @@ from service.geometry.rigid import Transform
 #: Greatest time between colour and depth of a pair, seconds. One camera gives both nearly the same stamp. TUM's sequences have
 #: separate stamps.
 PAIR_TOLERANCE_S = 0.02
+#: Hint for recorded depth whose origin nobody named.
+BASELINE_HINT = (
+    "the baseline of the depth is not known: if stereo matching measured the depth, give the distance of its cameras with --baseline-m "
+    "METRES{}; `evaluate` and `calibrate` then send it as the robot does"
+)
 Depth = UInt16[NDArray[np.uint16], "H W"] | Float32[NDArray[np.float32], "H W"]
 
 
@@ -120,6 +125,10 @@ class Recording(Protocol):
     @property
     def georeference(self) -> dict[str, Any] | None:
         """Georeference of the map frame of the recording's poses, or None."""
+
+    @property
+    def has_images(self) -> bool:
+        """Whether the recording has images."""
 
     def count(self) -> int:
         """Count scans and images together, for a progress bar."""

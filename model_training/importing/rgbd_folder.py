@@ -13,7 +13,7 @@ from model_training.datasets.dataset import LidarSensor, read_tum
 from model_training.datasets.files import read_bytes
 from model_training.importing.depth_scan import scan_from_depth
 from model_training.importing.kitti_files import read_rgb
-from model_training.importing.recording import PAIR_TOLERANCE_S, Event, Notes, RecordedPicture, Unusable
+from model_training.importing.recording import BASELINE_HINT, PAIR_TOLERANCE_S, Event, Notes, RecordedPicture, Unusable
 from model_training.importing.rectify import rectified
 from model_training.importing.trajectory import Trajectory
 from service.errors import DatasetError, StreetfixError
@@ -56,6 +56,7 @@ class RgbdFolder:
         camera: intrinsics.
         scale_m: metres per step of an integer depth.
         poses: T_map_vehicle, or None.
+        baseline_m: of the stereo rig that measured the depth, metres; None if it is not known.
         lidar: stands for the depth camera.
         georeference: always None.
     """
@@ -66,6 +67,7 @@ class RgbdFolder:
     camera: PinholeCamera
     scale_m: float
     poses: Trajectory | None
+    baseline_m: float | None = None
     lidar: LidarSensor = field(
         default_factory=lambda: LidarSensor(name="depth camera", T_vehicle_sensor=np.eye(4).tolist())
     )
@@ -77,7 +79,13 @@ class RgbdFolder:
         line = (
             f"{len(self.frames)} RGB-D frames; scans come from their depth, so the map covers only what the camera saw"
         )
-        return Notes((line,), {"path": self.path.name})
+        hints = (BASELINE_HINT.format(""),) if self.baseline_m is None else ()
+        return Notes((line,), {"path": self.path.name}, hints)
+
+    @property
+    def has_images(self) -> bool:
+        """Whether the recording has images."""
+        return bool(self.frames)
 
     def count(self) -> int:
         """Count one scan and one image per frame."""
@@ -131,15 +139,17 @@ class RgbdFolder:
             depth=depth,
             depth_scale_m=self.scale_m,
             file=frame.rgb,
+            baseline_m=self.baseline_m,
         )
 
 
-def open_tum_rgbd(source: Path, camera: PinholeCamera | None) -> RgbdFolder:
+def open_tum_rgbd(source: Path, camera: PinholeCamera | None, baseline_m: float | None = None) -> RgbdFolder:
     """Open TUM's layout: ``rgb.txt``, ``depth.txt``, ``groundtruth.txt`` (T_world_camera) and the images that they name.
 
     Args:
         source: the folder.
         camera: intrinsics; the layout does not contain them.
+        baseline_m: of the stereo rig that measured the depth, metres; None for other depth.
 
     Raises:
         DatasetError: a list is missing or broken, no colour image has a depth image, or there is no camera.
@@ -165,15 +175,16 @@ def open_tum_rgbd(source: Path, camera: PinholeCamera | None) -> RgbdFolder:
     if truth.is_file():
         times, T = read_tum(truth)
         poses = Trajectory(times, T, str(truth)).moved_by(_AHEAD)
-    return RgbdFolder("tum-rgbd", source, tuple(frames), camera, TUM_SCALE_M, poses)
+    return RgbdFolder("tum-rgbd", source, tuple(frames), camera, TUM_SCALE_M, poses, baseline_m)
 
 
-def open_open3d(source: Path, camera: PinholeCamera | None) -> RgbdFolder:
+def open_open3d(source: Path, camera: PinholeCamera | None, baseline_m: float | None = None) -> RgbdFolder:
     """Open a folder of Open3D's reconstruction: ``color``, ``depth``, ``camera_intrinsic.json``, ``trajectory.log``.
 
     Args:
         source: the folder.
         camera: intrinsics; by default those of the JSON file.
+        baseline_m: of the stereo rig that measured the depth, metres; None for other depth.
 
     Raises:
         DatasetError: images, camera or a pose are missing or broken.
@@ -198,7 +209,7 @@ def open_open3d(source: Path, camera: PinholeCamera | None) -> RgbdFolder:
     frames = tuple(RgbdFrame(k / RATE_HZ, a, b) for k, (a, b) in enumerate(zip(colour, depth, strict=True)))
     log = next((p for p in (source / "trajectory.log", source / "scene" / "trajectory.log") if p.is_file()), None)
     poses = None if log is None else _open3d_poses(log).moved_by(_AHEAD)
-    return RgbdFolder("open3d", source, frames, camera, OPEN3D_SCALE_M, poses)
+    return RgbdFolder("open3d", source, frames, camera, OPEN3D_SCALE_M, poses, baseline_m)
 
 
 def _listed(path: Path) -> list[tuple[float, Path]]:

@@ -5,7 +5,15 @@ from pathlib import Path
 from typing import Any
 
 from model_training.datasets.dataset import LidarSensor
-from model_training.importing.recording import PAIR_TOLERANCE_S, Event, Notes, RecordedPicture, RecordedScan, Unusable
+from model_training.importing.recording import (
+    BASELINE_HINT,
+    PAIR_TOLERANCE_S,
+    Event,
+    Notes,
+    RecordedPicture,
+    RecordedScan,
+    Unusable,
+)
 from model_training.importing.ros_cloud import points_of_cloud
 from model_training.importing.ros_content import BagSettings, content_of
 from model_training.importing.ros_frames import stamp_of
@@ -55,7 +63,17 @@ class RosBag:
             "depth=NAME, or --no-pictures"
         )
         source = {"path": self._path.name, "topics": names, "vehicle": self._content.vehicle}
-        return Notes(lines, source, (hint,) if lacking else ())
+        if lacking:
+            return Notes(lines, source, (hint,))
+        has_depth = self._settings.want_depth and topics.color is not None
+        unknown = has_depth and self._content.baseline_m is None
+        or_topic = ", or its right CameraInfo with --topic right_info=NAME"
+        return Notes(lines, source, (BASELINE_HINT.format(or_topic),) if unknown else ())
+
+    @property
+    def has_images(self) -> bool:
+        """Whether the recording has images."""
+        return self._content.topics.color is not None
 
     def count(self) -> int:
         """Count scans and colour images."""
@@ -123,4 +141,12 @@ class RosBag:
         if rgb.shape[:2] != size or (depth is not None and depth.shape != size):
             have = f"colour {rgb.shape[:2]}" + ("" if depth is None else f", depth {depth.shape}")
             return Unusable("image", name, f"sizes differ: {have}, camera {size}; record depth aligned to colour")
-        return RecordedPicture(name, pair.stamp_s, rgb, camera.pinhole, camera.T_vehicle_camera, depth=depth)
+        return RecordedPicture(
+            name,
+            pair.stamp_s,
+            rgb,
+            camera.pinhole,
+            camera.T_vehicle_camera,
+            depth=depth,
+            baseline_m=None if depth is None else self._content.baseline_m,
+        )

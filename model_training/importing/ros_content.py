@@ -8,12 +8,12 @@ import numpy as np
 
 from model_training.importing.extrinsics import Extrinsics
 from model_training.importing.ros_frames import FrameTree, stamp_of, transform_of
-from model_training.importing.ros_picture import camera_of
+from model_training.importing.ros_picture import baseline_of, camera_of
 from model_training.importing.ros_reader import BagReader, Damage
 from model_training.importing.ros_topics import POSE_TYPES, Topics, topics_of
 from model_training.importing.trajectory import Trajectory
 from service.bridge.pictures import is_rectified_by_name
-from service.errors import DatasetError
+from service.errors import DatasetError, RequestError
 from service.geometry.camera import PinholeCamera
 from service.geometry.rigid import Transform
 
@@ -25,12 +25,13 @@ class BagSettings:
     """Settings of the reader of a bag.
 
     Attributes:
-        topics: by role: scan, color, depth, info, poses.
+        topics: by role: scan, color, depth, info, right_info, poses.
         extrinsics: mountings that the bag does not contain.
         camera: intrinsics, if the bag has no CameraInfo.
         rectified: whether the images are rectified already; None decides by the topic's name.
         want_pictures: False needs neither intrinsics nor the camera's mounting.
         want_depth: False pairs no depth with colour.
+        baseline_m: of the stereo rig that measured the depth, metres; None if it is not known or in the topic ``right_info``.
         max_points: a larger scan is refused.
     """
 
@@ -40,6 +41,7 @@ class BagSettings:
     rectified: bool | None = None
     want_pictures: bool = True
     want_depth: bool = True
+    baseline_m: float | None = None
     max_points: int = 5_000_000
 
 
@@ -67,6 +69,7 @@ class BagContent:
         poses: T_map_vehicle; None if the bag has none.
         T_vehicle_lidar: maps points from the scan's frame to the vehicle frame (4, 4).
         camera: None if there are no images, or none are wanted.
+        baseline_m: of the stereo rig that measured the depth, metres; None if it is not known.
         remarks: what was assumed and left out, one line each.
     """
 
@@ -76,6 +79,7 @@ class BagContent:
     poses: Trajectory | None
     T_vehicle_lidar: Transform
     camera: BagCamera | None
+    baseline_m: float | None
     remarks: tuple[str, ...]
 
 
@@ -87,7 +91,8 @@ def content_of(bag: BagReader, settings: BagSettings) -> BagContent:
         settings: of the reader.
 
     Raises:
-        DatasetError: the bag has no scan, a given topic does not fit, or intrinsics or a mounting are missing.
+        DatasetError: the bag has no scan, a given topic does not fit, intrinsics or a mounting are missing, or the calibration of the
+            right camera gives no baseline.
     """
     topics = topics_of(bag.topics(), settings.topics, source=bag.name)
     scan_frame = bag.first(topics.scan.name).header.frame_id.lstrip("/")
@@ -108,7 +113,18 @@ def content_of(bag: BagReader, settings: BagSettings) -> BagContent:
     of = vehicle or ("the vehicle of --extrinsics" if T_given is not None else "the LiDAR")
     assumed = "" if vehicle or poses is None else " (assumed: the topic does not say)"
     remarks.insert(0, f"poses are of: {of}{assumed}")
-    return BagContent(topics, scan_frame, of, poses, T_vehicle_lidar, camera, tuple(remarks))
+    baseline_m = _baseline(bag, topics, settings)
+    return BagContent(topics, scan_frame, of, poses, T_vehicle_lidar, camera, baseline_m, tuple(remarks))
+
+
+def _baseline(bag: BagReader, topics: Topics, settings: BagSettings) -> float | None:
+    """Baseline as given, or from the calibration of the right camera, metres; None if neither is given."""
+    if topics.right_info is None:
+        return settings.baseline_m
+    try:
+        return baseline_of(bag.first(topics.right_info.name), topics.right_info.name)
+    except RequestError as error:
+        raise DatasetError(f"{bag.name}, topic {error.message}", field="right_info") from error
 
 
 def _poses(bag: BagReader, topics: Topics, remarks: list[str]) -> tuple[FrameTree, Trajectory | None, str]:

@@ -1,14 +1,16 @@
 """Read ``sensor_msgs/Image``, ``CompressedImage`` and ``CameraInfo``."""
 
 from dataclasses import replace
-from typing import Any
+from types import SimpleNamespace
+from typing import Any, cast
 
 import numpy as np
 from jaxtyping import UInt8
 from numpy.typing import NDArray
 
 from model_training.importing.recording import Depth
-from service.bridge.pictures import DEPTHS, LENSES
+from service.bridge.pictures import DEPTHS, LENSES, CameraInfoLike
+from service.bridge.rig import baseline_from
 from service.errors import StreetfixError
 from service.geometry.camera import PinholeCamera
 from service.geometry.distortion import COEFFICIENTS
@@ -105,6 +107,20 @@ def camera_of(message: Any, *, is_rectified: bool) -> PinholeCamera | str:
         wanted = " or ".join(str(n) for n in COEFFICIENTS[lens])
         return f"distortion_model {model!r} has {D.size} coefficients; expected {wanted} finite ones"
     return replace(camera, distortion=tuple(D.tolist()), distortion_model=lens)
+
+
+def baseline_of(message: Any, topic: str) -> float:
+    """Read the baseline of a stereo rig from the CameraInfo of its rectified right camera, metres.
+
+    Args:
+        message: sensor_msgs/CameraInfo, of ROS 1 or 2.
+        topic: of the message; named in errors.
+
+    Raises:
+        RequestError: the calibration gives no valid baseline.
+    """
+    projection = SimpleNamespace(p=message.P if hasattr(message, "P") else message.p)
+    return baseline_from(cast(CameraInfoLike, projection), topic)
 
 
 def _pixels(message: Any, dtype: str, channels: int) -> NDArray[Any] | str:

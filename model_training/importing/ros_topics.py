@@ -6,7 +6,9 @@ from dataclasses import dataclass
 from service.errors import DatasetError
 
 #: Roles that a topic can have.
-ROLES = ("scan", "color", "depth", "info", "poses")
+ROLES = ("scan", "color", "depth", "info", "right_info", "poses")
+#: A role that is never guessed: only the user knows whether a stereo rig measured the depth.
+_GIVEN_ONLY = frozenset({"right_info"})
 #: Types of messages with poses, the preferred one first.
 POSE_TYPES = (
     "nav_msgs/msg/Odometry",
@@ -20,6 +22,7 @@ _TYPES: dict[str, tuple[str, ...]] = {
     "color": _IMAGE_TYPES,
     "depth": _IMAGE_TYPES,
     "info": ("sensor_msgs/msg/CameraInfo",),
+    "right_info": ("sensor_msgs/msg/CameraInfo",),
     "poses": POSE_TYPES,
 }
 
@@ -48,6 +51,7 @@ class Topics:
         color: colour images.
         depth: depth images.
         info: intrinsics.
+        right_info: calibration of the right camera of the stereo rig that measured the depth.
         poses: poses.
         guessed: roles whose topic was not given.
     """
@@ -56,6 +60,7 @@ class Topics:
     color: Topic | None
     depth: Topic | None
     info: Topic | None
+    right_info: Topic | None
     poses: Topic | None
     guessed: tuple[str, ...]
 
@@ -77,7 +82,7 @@ def topics_of(available: list[Topic], given: Mapping[str, str], *, source: str) 
 
     Args:
         available: all topics of the bag.
-        given: topics of the caller by role; the others are guessed.
+        given: topics of the caller by role; the others are guessed, except ``right_info``.
         source: name of the bag, for errors.
 
     Raises:
@@ -99,7 +104,7 @@ def topics_of(available: list[Topic], given: Mapping[str, str], *, source: str) 
             )
     chosen = {role: by_name[name] for role, name in given.items()}
     for role in ROLES:
-        if role not in chosen and (topic := _guess(role, available, chosen)) is not None:
+        if role not in chosen and role not in _GIVEN_ONLY and (topic := _guess(role, available, chosen)) is not None:
             chosen[role] = topic
     if "scan" not in chosen:
         have = ", ".join(f"{topic.name} ({topic.msgtype})" for topic in available) or "nothing"
@@ -111,6 +116,7 @@ def topics_of(available: list[Topic], given: Mapping[str, str], *, source: str) 
         color=chosen.get("color"),
         depth=chosen.get("depth"),
         info=chosen.get("info"),
+        right_info=chosen.get("right_info"),
         poses=chosen.get("poses"),
         guessed=tuple(role for role in ROLES if role not in given),
     )

@@ -4,7 +4,7 @@ This takes one pass over the recording, one frame at a time. Unusable frames are
 """
 
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -47,6 +47,8 @@ class TakeSettings:
             its nearest scan was left out. So the map does not contain the time of a query. Other images are counted.
         hold_out_first: number of the first scan that is left out, from 0; None for the last scan of each group.
         max_points: a scan with more points is left out.
+        georeference: of the frame of the trajectory, as in ``dataset.json``. None takes that of the recording, if ``own_frame``.
+        own_frame: the trajectory is in the frame of the recording's own poses. False: found by odometry.
     """
 
     queries: str = "recorded"
@@ -57,6 +59,8 @@ class TakeSettings:
     hold_out: int = 0
     hold_out_first: int | None = None
     max_points: int = 5_000_000
+    georeference: Mapping[str, Any] | None = None
+    own_frame: bool = True
 
     def __post_init__(self) -> None:
         """Check the settings.
@@ -214,11 +218,12 @@ class _Taking:
             "hold_out": settings.hold_out,
             "dropped": self.dropped.lines(),
         }
+        own = recording.georeference if settings.own_frame else None
         description = DatasetDescription(
             name=name,
             source=source,
             sensors=Sensors(lidars=[recording.lidar], cameras=cameras),
-            georeference=recording.georeference,
+            georeference=own if settings.georeference is None else dict(settings.georeference),
         )
         write_description(self._out, description)
         return TakeSummary(

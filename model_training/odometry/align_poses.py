@@ -22,6 +22,10 @@ from service.geometry.rigid import inverse
 Report = Callable[[str, int, int], None]
 #: Formats whose own poses come from GNSS and inertial sensors. These are aligned by default.
 ALIGNED_KINDS = frozenset({"kitti-raw"})
+#: Formats whose poses come from a simulator. They have no errors to correct.
+_EXACT_KINDS = frozenset({"carla"})
+#: What to say about poses that are not aligned.
+HOW_TO_ALIGN = "if they err by decimetres, --align corrects them with the scans (--no-align hides this line)"
 #: Greatest time between a scan and the given poses, seconds. A scan beyond it has no initial guess and is left out.
 TOLERANCE_S = 0.1
 
@@ -126,13 +130,15 @@ def usual_poses(
         report: called with the stage, the scans done and all scans.
 
     Returns:
-        T_map_vehicle, and the line; None without a line if alignment was not wanted.
+        T_map_vehicle, and the line; None without a line if ``align`` is False, or if the poses come from a simulator.
 
     Raises:
         ExtraMissingError: ``align`` is True, and a package is not installed.
     """
-    if align is False or (align is None and recording.kind not in ALIGNED_KINDS):
+    if align is False or (align is None and recording.kind in _EXACT_KINDS):
         return trajectory, None
+    if align is None and recording.kind not in ALIGNED_KINDS:
+        return trajectory, f"poses are the recording's own; {HOW_TO_ALIGN}"
     try:
         found = aligned_with_scans(recording, trajectory, report=report)
     except ExtraMissingError as missing:

@@ -83,7 +83,9 @@ def _run(run: SavedRun) -> str:
     made = f"streetfix {settings.streetfix}" + (f", commit {settings.commit[:10]}" if settings.commit else "")
     asked = "registered" if settings.registered else "retrieval alone"
     asked_of = f"map {settings.map.name} version {settings.map.version}"
-    return f"{run.folder.name}, {asked_of}, {asked}, {made}, {settings.made_at:%Y-%m-%d %H:%M} UTC"
+    return (
+        f"{run.folder.name}, {asked_of}, {settings.described()}, {asked}, {made}, {settings.made_at:%Y-%m-%d %H:%M} UTC"
+    )
 
 
 def row_of(label: str, each: PairedShares) -> list[str]:
@@ -164,7 +166,7 @@ def _changed(
         rows, key=lambda row: -abs(np.nan_to_num(errors[1][row] - errors[0][row], nan=0.0, posinf=1e9, neginf=-1e9))
     )
     shown = []
-    for name, number, row in locate(by_change[:_SHOWN], first.predictions):
+    for name, number, row in locate(by_change[:_SHOWN], first.predictions, first_image=first.settings.mode.frames - 1):
         statuses = "".join(
             f'<br>{run}: <span class="tag">{escape(became[k][row])}</span> {_off(errors[k][row])}'
             for k, run in enumerate(("A", "B"))

@@ -30,19 +30,20 @@ class Shown:
     said: str
 
 
-def locate(rows: Sequence[int], runs: dict[str, Predictions]) -> list[tuple[str, int, int]]:
-    """Return set, number in the set, and row for rows of the joined sets.
+def locate(rows: Sequence[int], runs: dict[str, Predictions], *, first_image: int = 0) -> list[tuple[str, int, int]]:
+    """Return set, number of the image in the set, and row for rows of the joined sets.
 
     Args:
         rows: rows of the joined sets.
         runs: answers by set.
+        first_image: number of the image whose pose the first query of a set asks for.
     """
     found = []
     for row in rows:
         first = 0
         for name, p in runs.items():
             if row < first + len(p.T_true):
-                found.append((name, row - first, row))
+                found.append((name, row - first + first_image, row))
                 break
             first += len(p.T_true)
     return found

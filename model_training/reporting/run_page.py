@@ -7,8 +7,10 @@ from typing import Any
 
 from model_training.datasets.dataset import Dataset
 from model_training.evaluation.failures import WHY, Stage, position_errors, stages, worst
+from model_training.evaluation.measures import label_of
 from model_training.evaluation.predict import Predictions, joined
 from model_training.evaluation.saved_run import SavedRun
+from model_training.evaluation.why_refused import FEW, NO_CAUSE
 from model_training.reporting.charts import (
     error_curve,
     error_histogram,
@@ -61,11 +63,13 @@ def write_run_page(run: SavedRun, bundle: Map, dataset: Dataset, figures: dict[s
         Section("map", "The map, coloured by error", _map(plan, everything)),
         Section("lost", "Losses by stage", _lost(everything)),
     ]
+    if causes := causes_of(figures):
+        sections.insert(1, Section("causes", "What to check", causes))
     if len(run.predictions) > 1:
         sections.insert(1, Section("conditions", "Conditions", _conditions(run, figures)))
     if figures.get("confusion"):
         sections.append(Section("streets", "Streets", _confusion(figures["confusion"])))
-    sections.append(Section("worst", "The worst queries", _worst(run.predictions, everything, dataset, plan)))
+    sections.append(Section("worst", "The worst queries", _worst(run, everything, dataset, plan)))
     path = run.folder / PAGE
     write_page(path, page(f"{run.settings.dataset.name} on map {run.settings.map.name}", _lead(run, figures), sections))
     return path
@@ -80,6 +84,7 @@ def _lead(run: SavedRun, figures: dict[str, Any]) -> str:
         f"(95 % interval {low:.1%} to {high:.1%}); {figures['localized']:.1%} were accepted at all.</p>"
         f'<p class="soft">Map {escape(settings.map.name)}, version {escape(settings.map.version)}; dataset '
         f"{escape(settings.dataset.name)}; "
+        f"{escape(settings.described())}; "
         f"{'registered on the cloud' if settings.registered else 'retrieval alone'}; {escape(made)}; "
         f"{settings.made_at:%Y-%m-%d %H:%M} UTC.</p>"
     )
@@ -88,7 +93,10 @@ def _lead(run: SavedRun, figures: dict[str, Any]) -> str:
 def _figures(figures: dict[str, Any]) -> str:
     columns = _columns(figures)
     rows = [
-        [escape(label), *(_share(values, key) for values in columns.values())]
+        [
+            escape(label_of(key, label, registered=figures["registered"])),
+            *(_share(values, key) for values in columns.values()),
+        ]
         for key, label in _SHARES
         if figures.get(key) is not None
     ]
@@ -123,6 +131,7 @@ def _share(values: dict[str, Any], key: str) -> str:
 
 def _conditions(run: SavedRun, figures: dict[str, Any]) -> str:
     sets = figures["sets"]
+    recall = label_of("recall_at_1_5m", "R@1 at 5 m", registered=figures["registered"])
     rows = [
         [
             f"{k}. {escape(each.name)}",
@@ -137,13 +146,32 @@ def _conditions(run: SavedRun, figures: dict[str, Any]) -> str:
             side_by_side({name: (values[key], *values["ci95"][key]) for name, values in sets.items()}, label),
             f"{label}, with 95 % intervals.",
         )
-        for key, label in (("within_1_m", "within 1 m"), ("recall_at_1_5m", "R@1 at 5 m"))
+        for key, label in (("within_1_m", "within 1 m"), ("recall_at_1_5m", recall))
     ]
     return table(
         "Each query set with weather and light, and how its queries relate to the survey.",
-        ["set", "condition", "split", "answered", "within 1 m", "R@1 at 5 m"],
+        ["set", "condition", "split", "answered", "within 1 m", recall],
         rows,
     ) + _pair(drawn)
+
+
+def causes_of(figures: dict[str, Any]) -> str:
+    """Return the possible causes of each set as HTML, the likeliest first; empty if nothing is to be checked.
+
+    Args:
+        figures: figures of the evaluation, with the causes that ``streetfix evaluate`` adds for a calibrated map.
+    """
+    parts = []
+    for name, values in figures["sets"].items():
+        found = values.get("causes")
+        if found is None or (values["localized"] >= FEW and not found):
+            continue
+        listed = "".join(f"<li>{escape(each['what'])}: {escape(each['check'])}</li>" for each in found)
+        told = f"<ol>{listed}</ol>" if found else f"<p>{NO_CAUSE}</p>"
+        parts.append(
+            f"<p>{escape(name)}: {values['localized']:.0%} of the answers were accepted. The likeliest cause first.</p>{told}"
+        )
+    return "".join(parts)
 
 
 def _errors(runs: dict[str, Predictions], everything: Predictions) -> str:
@@ -225,11 +253,13 @@ def _confusion(confusion: dict[str, Any]) -> str:
     )
 
 
-def _worst(runs: dict[str, Predictions], everything: Predictions, dataset: Dataset, plan: Plan) -> str:
+def _worst(run: SavedRun, everything: Predictions, dataset: Dataset, plan: Plan) -> str:
     became, errors = stages(everything), position_errors(everything)
     shown = [
         Shown(name, number, row, said_of(everything, row, became[row], errors[row]))
-        for name, number, row in locate(worst(everything, WORST), runs)
+        for name, number, row in locate(
+            worst(everything, WORST), run.predictions, first_image=run.settings.mode.frames - 1
+        )
     ]
     words = (
         "<p>Accepted wrong answers come first, then the others by distance. On the small maps the circle is the true "

@@ -21,15 +21,15 @@ def events_of_answers(run: SavedRun, dataset: Dataset | None) -> Iterator[Event]
         run: saved evaluation.
         dataset: dataset of the queries; None if absent.
     """
-    now_s = 0.0
+    now_s, last = 0.0, run.settings.mode.frames - 1  # a query asks for the pose of its last image
     for name, p in run.predictions.items():
         frames = [] if dataset is None else list(dataset.queries(name))
         became, errors = stages(p), position_errors(p)
         for row in range(len(p.T_true)):
-            yield from _query(p, row, now_s, frames[row] if frames else None)
+            yield from _query(p, row, now_s, frames[row + last] if frames else None)
             off = f"{errors[row]:.2f} m off" if np.isfinite(errors[row]) else "no answer"
             sure = "" if np.isnan(p.confidence[row]) else f", confidence {p.confidence[row]:.2f}"
-            text = f"{name}, query {row}: {became[row]}; {off}{sure}"
+            text = f"{name}, query {row + last}: {became[row]}; {off}{sure}"
             yield Note("answer/log", now_s, text, became[row] is Stage.RIGHT)
             now_s += STEP_S
 

@@ -1,6 +1,7 @@
 """Print an answer of the service as readable text."""
 
 import math
+from collections import Counter
 from typing import Any
 
 from rich.console import Console
@@ -9,6 +10,8 @@ from rich.table import Table
 
 #: Width of a table with one row per pair in a file or a pipe, characters.
 _WIDTH = 160
+#: A batch with a smaller share of LOCALIZED answers says why.
+_FEW = 0.25
 
 
 def print_answer(answer: dict[str, Any], console: Console | None = None) -> None:
@@ -41,6 +44,8 @@ def print_answer(answer: dict[str, Any], console: Console | None = None) -> None
 
 def print_outcomes(names: list[str], outcomes: list[dict[str, Any]], console: Console | None = None) -> None:
     """Print one row per answer of a batch, the problems of refused pairs, and a summary.
+
+    If less than a quarter of the pairs are LOCALIZED, also print what to check, the most frequent reason first.
 
     Args:
         names: of the image pairs, in order. There may be more names than outcomes.
@@ -75,6 +80,36 @@ def print_outcomes(names: list[str], outcomes: list[dict[str, Any]], console: Co
         out.print(line, markup=False, soft_wrap=True)
     localized = sum(each["answer"] is not None and each["answer"]["status"] == "LOCALIZED" for each in outcomes)
     out.print(f"{localized} of {len(outcomes)} pairs LOCALIZED, {len(problems)} refused")
+    lost = [
+        each["answer"] for each in outcomes if each["answer"] is not None and each["answer"]["status"] != "LOCALIZED"
+    ]
+    if lost and localized < _FEW * len(outcomes):
+        for line in _why_most(lost):
+            out.print(line, markup=False, soft_wrap=True)
+
+
+def _why_most(answers: list[dict[str, Any]]) -> list[str]:
+    """Lines that say what to check for several answers that are not LOCALIZED, the most frequent reason first, then the likeliest."""
+    from service.confidence.reasons import GROUPS
+
+    told = [answer["reasons"] for answer in answers if "reasons" in answer]  # an older service sends none
+    if not told:
+        return ["The service gives no reasons."]
+    order = {check: number for number, (check, _, _) in enumerate(GROUPS)}
+    counts = Counter(check for reasons in told for check in {reason["check"] for reason in reasons})
+    remedies: dict[str, Counter[str]] = {check: Counter() for check in counts}
+    for reason in (reason for reasons in told for reason in reasons):
+        remedies[reason["check"]][reason["remedy"]] += 1
+    lines = [f"why {len(answers)} answers may not be LOCALIZED, the most frequent reason first"]
+    for number, check in enumerate(sorted(counts, key=lambda each: (-counts[each], order.get(each, -1))), 1):
+        lines.append(f"  {number}. {check} ({counts[check]} of {len(answers)}): {remedies[check].most_common(1)[0][0]}")
+    unexplained = sum(not reasons for reasons in told)
+    if unexplained:
+        lines.append(
+            f"  {unexplained} of {len(answers)} answers: all confidence features are in the range of the calibration data. "
+            "The place may be outside the map or a perceptual alias."
+        )
+    return lines
 
 
 def _facts(answer: dict[str, Any]) -> list[tuple[str, str]]:

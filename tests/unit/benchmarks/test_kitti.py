@@ -175,6 +175,16 @@ def test_a_packed_drive_is_recognised(tmp_path):
     assert (found.packed, found.folder) == (True, tmp_path / "kitti_0005")
 
 
+def test_a_name_of_no_drive_is_refused_before_the_work_even_beside_a_valid_one(tmp_path, monkeypatch, capsys):
+    drive(tmp_path, "sequences/00/velodyne", "sequences/00/image_3")
+    monkeypatch.setattr("sys.argv", ["bench", "--root", str(tmp_path), "--only", "00", "typo"])
+    monkeypatch.setattr(bench, "_mapped", lambda *_: pytest.fail("the work began"))
+    with pytest.raises(SystemExit) as end:
+        bench.main()
+    assert end.value.code == 2
+    assert "--only: no drive typo below --root; choose among: 00" in " ".join(capsys.readouterr().err.split())
+
+
 def test_a_recording_that_was_not_measured_is_named_with_the_reason(tmp_path):
     drives = [Drive(name, "kitti-raw", tmp_path) for name in ("00", "05", "2011_09_26_drive_0013")]
     told = left_out(drives, drives[:1])

@@ -187,6 +187,22 @@ def test_a_rig_is_added_to_that_of_a_recording_and_the_answers_of_each_state_the
         assert localizer.localize(replace(query, camera=camera)).rig_correction == name
 
 
+def test_a_correction_of_the_same_camera_with_another_baseline_gives_a_warning(town, drive, few_places, capsys):
+    given = ("calibrate", "--map", town, "--drive", drive, "--workers", "1")
+    assert run(*given) == 0
+    assert run(*given) == 0
+    assert "warning" not in capsys.readouterr().out  # the same rig: replaced
+    file = drive / "dataset.json"
+    told = json.loads(file.read_text())
+    told["sensors"]["cameras"][0]["depth"]["baseline_m"] = 0.12
+    file.write_text(json.dumps(told))
+    assert run(*given) == 0
+    (line,) = [line for line in capsys.readouterr().out.splitlines() if line.startswith("warning: ")]
+    assert line.startswith("warning: the kept correction small is for the same camera with no baseline and")
+    assert "this one is for baseline 0.12 m and" in line
+    assert "with its baseline (--baseline-m), and calibrate again" in line
+
+
 def test_a_rate_that_the_images_cannot_support_is_refused_before_the_work(town, small_dataset, capsys, monkeypatch):
     def nothing_is_asked(*_, **__):
         raise AssertionError("the work began")

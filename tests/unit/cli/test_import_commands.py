@@ -7,8 +7,6 @@ import numpy as np
 import pytest
 
 from model_training.datasets.dataset import Dataset
-from model_training.importing.clouds import Clouds
-from model_training.importing.recording import Notes
 from service.cli.main import main
 
 
@@ -69,18 +67,11 @@ def test_help_says_which_options_need_an_extra(capsys):
     assert "The command ignores the recording's own poses. Needs the extra odometry." in told
 
 
-def test_lines_about_images_are_printed_only_if_images_are_wanted(scans, tmp_path, capsys, monkeypatch):
-    lines = Notes(("a list",), {"path": "scans"}, ("no image has stored depth",))
-    monkeypatch.setattr(Clouds, "notes", lines)
-    assert run("import", "clouds", scans, "--out", tmp_path / "with") == 0
-    assert "a list\nno image has stored depth\n" in capsys.readouterr().out
-    assert run("import", "clouds", scans, "--no-pictures", "--out", tmp_path / "without") == 0
-    assert "no image has stored depth" not in capsys.readouterr().out
-
-
-def test_import_takes_poses_of_another_file(scans, tmp_path):
+def test_import_takes_poses_of_another_file(scans, tmp_path, capsys):
     poses = (scans / "poses.txt").rename(tmp_path / "mine.txt")
     assert run("import", "clouds", scans, "--poses", poses, "--out", tmp_path / "out") == 0
+    told = capsys.readouterr().out.replace("\n", " ")
+    assert f"poses are those of {poses}; if they err by decimetres, --align corrects them with the scans" in told
     np.testing.assert_allclose(Dataset(tmp_path / "out").survey_poses()[:, 0, 3], [0, 1, 2])
 
 
@@ -92,24 +83,24 @@ def test_import_without_poses_says_where_they_may_come_from(scans, tmp_path, cap
 
 
 @pytest.mark.parametrize(
-    ("options", "message"),
+    ("kind", "options", "message"),
     [
-        (("--topic", "scan"), "topic: 'scan' is not ROLE=NAME"),
-        (("--topic", "scan=/x"), "topic: clouds does not support this option"),
-        (("--sync", "guess"), "sync: 'guess' is not valid; choose interpolate or nearest"),
-        (("--depth", "sgbm"), "clouds has no 'sgbm' depth"),
-        (("--hold-out", "1"), "hold_out: 1 would leave no survey"),
-        (("--extrinsics", "nowhere.json"), "nowhere.json: cannot be read as JSON"),
-        (("--camera", "nowhere.json"), "nowhere.json: not a valid camera"),
-        (("--poses", "nowhere.txt"), "nowhere.txt is missing"),
+        ("rosbag", ("--topic", "scan"), "topic: 'scan' is not ROLE=NAME"),
+        ("rosbag", ("--sync", "guess"), "sync: 'guess' is not valid; choose interpolate or nearest"),
+        ("rosbag", ("--depth", "sgbm"), "rosbag has no 'sgbm' depth"),
+        ("clouds", ("--hold-out", "1"), "hold_out: 1 would leave no survey"),
+        ("rosbag", ("--extrinsics", "nowhere.json"), "nowhere.json: cannot be read as JSON"),
+        ("rosbag", ("--camera", "nowhere.json"), "nowhere.json: not a valid camera"),
+        ("clouds", ("--poses", "nowhere.txt"), "nowhere.txt is missing"),
         (
+            "clouds",
             ("--poses", "x.txt", "--odometry"),
             "--odometry finds the poses, so --poses has no effect; give one of the two",
         ),
     ],
 )
-def test_import_refuses_an_option_by_name(scans, tmp_path, capsys, options, message):
-    assert run("import", "clouds", scans, "--out", tmp_path / "out", *options) == 1
+def test_import_refuses_an_option_by_name(scans, tmp_path, capsys, kind, options, message):
+    assert run("import", kind, scans, "--out", tmp_path / "out", *options) == 1
     assert message in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
 

@@ -375,3 +375,44 @@ def test_the_table_of_a_batch_names_images_and_streets_in_whole_words(write: Any
         "pair 1 (rgb.png): Too few. no depth [field requests.1.depth]",
         "1 of 3 pairs LOCALIZED, 1 refused",
     ]
+
+
+def reasons_of(*checks: str) -> list[dict[str, Any]]:
+    return [{"check": check, "evidence": {}, "remedy": f"remedy of {check}"} for check in checks]
+
+
+def test_a_batch_of_few_poses_says_what_to_check_the_most_frequent_reason_first(
+    write: Any, run: Any, answering: Any
+) -> None:
+    """Equally frequent reasons are in the order of a single answer: intrinsics before baseline."""
+    reasons = [("baseline", "calibration"), ("calibration",), ("intrinsics", "calibration"), ()]
+    outcomes = [{"answer": answer_of("AMBIGUOUS", reasons=reasons_of(*each)), "problem": None} for each in reasons]
+    answering(httpx.Response(200, json={"outcomes": outcomes}))
+    code, out, _ = run("--batch", write(SHARED | {"requests": [PAIR] * 4}))
+    assert code == 3
+    assert out.splitlines()[5:] == [
+        "0 of 4 pairs LOCALIZED, 0 refused",
+        "why 4 answers may not be LOCALIZED, the most frequent reason first",
+        "  1. calibration (3 of 4): remedy of calibration",
+        "  2. intrinsics (1 of 4): remedy of intrinsics",
+        "  3. baseline (1 of 4): remedy of baseline",
+        (
+            "  1 of 4 answers: all confidence features are in the range of the calibration data. The place may be outside the map or a "
+            "perceptual alias."
+        ),
+    ]
+
+
+@pytest.mark.parametrize(("localized", "is_told"), [(0, True), (1, False)])
+def test_a_batch_with_a_quarter_of_poses_gives_no_reasons(
+    write: Any, run: Any, answering: Any, localized: int, is_told: bool
+) -> None:
+    statuses = ["LOCALIZED"] * localized + ["AMBIGUOUS"] * (4 - localized)
+    outcomes = [{"answer": answer_of(status, reasons=reasons_of("baseline")), "problem": None} for status in statuses]
+    answering(httpx.Response(200, json={"outcomes": outcomes}))
+    assert ("remedy of baseline" in run("--batch", write(SHARED | {"requests": [PAIR] * 4}))[1]) == is_told
+
+
+def test_a_service_without_reasons_is_named_in_a_batch(write: Any, run: Any, answering: Any) -> None:
+    answering(httpx.Response(200, json={"outcomes": [{"answer": answer_of("AMBIGUOUS"), "problem": None}]}))
+    assert run("--batch", write(SHARED | {"requests": [PAIR]}))[1].endswith("The service gives no reasons.\n")

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from model_training.evaluation.compare import compare
+from model_training.evaluation.query_mode import QueryMode
 from model_training.evaluation.saved_run import SavedRun
 from service.errors import DatasetError
 
@@ -96,3 +97,23 @@ def test_runs_over_other_queries_are_refused(run_of, answers_of, other):
     errors = other.pop("errors")
     with pytest.raises(DatasetError, match=r"query set 'x': a .* have different queries"):
         compare(run_of("a", x=answered(answers_of, 1)), run_of("b", x=answered(answers_of, *errors, **other)))
+
+
+def in_mode(run, **mode):
+    return replace(run, settings=run.settings.model_copy(update={"mode": QueryMode(**mode)}))
+
+
+def test_a_comparison_says_what_each_run_measured(run_of, answers_of):
+    answers = answered(answers_of, 0.1, 9)
+    found = compare(run_of("a", x=answers), in_mode(run_of("b", x=answers), prior_std_m=3))
+    assert found.modes == ("single images", "single images, prior of 3 m")
+    assert found.as_json()["modes"] == ["single images", "single images, prior of 3 m"]
+
+
+def test_queries_of_another_number_of_images_are_refused(run_of, answers_of):
+    answers = answered(answers_of, 0.1, 9)
+    with pytest.raises(
+        DatasetError,
+        match=r"a measured single images, and b 5 consecutive images .* evaluate both with the same --frames",
+    ):
+        compare(run_of("a", x=answers), in_mode(run_of("b", x=answers), frames=5))

@@ -92,6 +92,7 @@ class ListedRecording:
     kind: str = "listed"
     notes: Notes = field(default_factory=lambda: Notes(("a list",), {"path": "list"}))
     georeference: dict[str, Any] | None = None
+    has_images: bool = True
 
     def count(self) -> int:
         return 10

@@ -39,6 +39,22 @@ def test_nothing_at_the_name_is_refused(tmp_path, kind):
             OpenSettings(extrinsics=Extrinsics(T_vehicle_lidar=np.eye(4))),
             "extrinsics: clouds does not support this option",
         ),
+        ("carla", OpenSettings(baseline_m=0.1), "baseline-m: carla does not support this option"),
+        (
+            "rosbag",
+            OpenSettings(baseline_m=0.1, topics={"right_info": "/r"}),
+            "baseline-m 0.1: the topic right_info gives a baseline too; give one of the two",
+        ),
+        (
+            "rosbag",
+            OpenSettings(baseline_m=0.1, depth="lidar"),
+            "baseline-m 0.1: --depth lidar takes the depth from the scans, so there is no stereo depth; omit one of the two",
+        ),
+        (
+            "rosbag",
+            OpenSettings(topics={"right_info": "/r"}, pictures=False),
+            "topic right_info: --no-pictures imports no depth, so there is no stereo depth; omit one of the two",
+        ),
     ],
 )
 def test_an_option_that_would_do_nothing_is_refused(tmp_path, kind, settings, why):

@@ -84,6 +84,17 @@ def test_missing_entries_of_tum_lists_are_named(tum, file, text, why):
         open_tum_rgbd(tum, CAMERA)
 
 
+@pytest.mark.parametrize("layout", ["tum", "open3d"])
+def test_the_depth_of_a_stereo_camera_carries_its_baseline(layout, request):
+    source, opened = request.getfixturevalue(layout), {"tum": open_tum_rgbd, "open3d": open_open3d}[layout]
+    folder = opened(source, CAMERA, 0.05)
+    pictures = [event for event in folder.events() if isinstance(event, RecordedPicture)]
+    assert [picture.baseline_m for picture in pictures] == [0.05, 0.05]
+    assert folder.notes.picture_lines == ()
+    (hint,) = opened(source, CAMERA).notes.picture_lines
+    assert "give the distance of its cameras with --baseline-m METRES; `evaluate` and" in hint
+
+
 def test_tums_layout_needs_a_camera_and_does_without_truth(tum):
     (tum / "groundtruth.txt").unlink()
     assert open_tum_rgbd(tum, CAMERA).trajectory() is None

@@ -89,7 +89,45 @@ def test_a_bag_without_a_topic_of_depth_says_what_serves_its_pictures(ros, drive
         "or --no-pictures"
     )
     assert opened(path, want_depth=False).notes.picture_lines == ()
-    assert opened(ros.write(tmp_path / "whole", drive(count=2))).notes.picture_lines == ()
+
+
+RIGHT = "/camera/right/camera_info"
+
+
+def with_right_info(ros, drive, shift):
+    """Return the drive with the calibration of a right camera: fx is 8 px, and P[0, 3] the given shift."""
+    message = ros.info(0.0)
+    message.p[3] = shift
+    return [*drive(count=2), (RIGHT, 0.2, message)]
+
+
+@pytest.mark.parametrize(
+    ("told", "baseline_m"),
+    [({"topics": {"right_info": RIGHT}}, 0.12), ({"baseline_m": 0.3}, 0.3), ({}, None)],
+)
+def test_the_depth_of_a_stereo_rig_carries_its_baseline(ros, drive, tmp_path, told, baseline_m):
+    bag = opened(ros.write(tmp_path / "bag", with_right_info(ros, drive, -0.96)), **told)  # 0.96 px m / 8 px = 0.12 m
+    pictures = [event for event in bag.events() if isinstance(event, RecordedPicture)]
+    assert [picture.baseline_m for picture in pictures] == [pytest.approx(baseline_m)] * 2
+    hints = bag.notes.picture_lines
+    assert len(hints) == (baseline_m is None)
+    assert all("--baseline-m METRES, or its right CameraInfo with --topic right_info=NAME;" in hint for hint in hints)
+    assert bag.notes.source["topics"]["right_info"] == (RIGHT if "topics" in told else None)
+
+
+def test_a_left_calibration_gives_no_baseline_and_is_named(ros, drive, tmp_path):
+    path = ros.write(tmp_path / "bag", with_right_info(ros, drive, 0.0))
+    with pytest.raises(
+        DatasetError, match=rf"bag, topic {RIGHT}: .*mean a baseline of 0 m.*name the CameraInfo of the rectified right"
+    ):
+        opened(path, topics={"right_info": RIGHT})
+
+
+def test_the_depth_of_scans_has_no_baseline(ros, drive, tmp_path):
+    path = ros.write(tmp_path / "bag", drive(count=2))
+    bag = opened(path, want_depth=False)
+    assert bag.notes.picture_lines == ()
+    assert [event.baseline_m for event in bag.events() if isinstance(event, RecordedPicture)] == [None, None]
 
 
 def test_a_bag_without_a_point_cloud_is_refused(ros, drive, tmp_path):

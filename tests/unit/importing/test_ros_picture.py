@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from model_training.importing.ros_picture import camera_of, colour_of, depth_of
+from model_training.importing.ros_picture import baseline_of, camera_of, colour_of, depth_of
 
 RGB = np.random.default_rng(0).integers(0, 256, (3, 5, 3), dtype=np.uint8)
 
@@ -121,6 +121,12 @@ def test_ros_1_writes_its_matrices_in_capitals():
     told = vars(info())
     ros_1 = Message(**{(k.upper() if len(k) == 1 else k): v for k, v in told.items()})
     assert camera_of(ros_1, is_rectified=False) == camera_of(info(), is_rectified=False)
+
+
+@pytest.mark.parametrize("key", ["p", "P"])  # ROS 2, ROS 1
+def test_the_baseline_is_the_shift_over_the_focal_length(key):
+    projection = [90.0, 0, 52, -18.0, 0, 91, 42, 0, 0, 0, 1, 0]
+    assert baseline_of(Message(**{key: projection}), "/right") == 0.2
 
 
 @pytest.mark.parametrize("d", [[0.1, 0, 0, 0], [0, 0, 0, 0]])

@@ -61,6 +61,15 @@ def test_given_values_are_not_guessed_and_lines_list_them():
     assert topics.lines()[-1] == "poses: none"
 
 
+def test_the_right_camera_is_never_guessed_and_is_not_the_left_one_once_given():
+    available = [image("/left/image"), info("/right/camera_info"), info("/left/camera_info")]
+    assert topics_of([SCAN, *available], {}, source="x").right_info is None
+    given = topics_of([SCAN, *available], {"right_info": "/right/camera_info"}, source="x")
+    names = [topic and topic.name for topic in (given.right_info, given.info)]
+    assert names == ["/right/camera_info", "/left/camera_info"]
+    assert "right_info: /right/camera_info, 10 x CameraInfo" in given.lines()
+
+
 @pytest.mark.parametrize(
     ("told", "why"),
     [

@@ -42,6 +42,7 @@ class HallDrive:
     kind: str = "hall"
     notes: Notes = field(default_factory=Notes)
     georeference: dict[str, Any] | None = None
+    has_images: bool = False
 
     def count(self) -> int:
         return self.count_of_scans

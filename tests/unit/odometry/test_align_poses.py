@@ -100,13 +100,23 @@ class Raw(HallDrive):
 
 def test_only_formats_with_inertial_poses_are_aligned_by_default():
     wrong = given(swinging)
-    assert usual_poses(HallDrive(), wrong) == (wrong, None)
     assert usual_poses(Raw(), wrong, align=False) == (wrong, None)
+    assert usual_poses(HallDrive(), wrong, align=False) == (wrong, None)
     for drive, align in ((Raw(), None), (HallDrive(), True)):
         poses, line = usual_poses(drive, wrong, align=align)
         assert poses is not wrong
         assert line is not None
         assert "aligned with 15 scans" in line
+
+
+def test_poses_that_stay_are_named_with_the_option_that_corrects_them():
+    wrong = given(swinging)
+    poses, line = usual_poses(HallDrive(), wrong)
+    assert poses is wrong
+    assert line == (
+        "poses are the recording's own; if they err by decimetres, --align corrects them with the scans (--no-align hides this line)"
+    )
+    assert usual_poses(HallDrive(kind="carla"), wrong) == (wrong, None)  # exact
 
 
 def test_without_the_packages_poses_stay_and_a_line_says_so_unless_it_was_asked_for(monkeypatch):
