@@ -22,6 +22,7 @@ from model_training.mapping.tiled_care import diff_of_tiles, merge_tiled
 from model_training.mapping.update import update_map
 from model_training.mapping.update_tiled import update_tiled
 from model_training.mapping.verify import damage_of
+from service.cli.map_folders import folder_of_map, folder_of_new_map
 from service.errors import BundleError
 from service.maps.calibration import RigCorrection
 from service.maps.manifest import Manifest, read_manifest
@@ -38,9 +39,9 @@ app = typer.Typer(
     help="Maintain map bundles: info, verify, diff, merge, update, push, pull, index.",
 )
 
-_Bundle = Annotated[Path, typer.Argument(help="Folder of a map bundle.")]
+_Bundle = Annotated[Path, typer.Argument(help="Folder of a map bundle.", callback=folder_of_map)]
 _Json = Annotated[bool, typer.Option("--json", help="Print JSON.")]
-_Out = Annotated[Path, typer.Option(help="Folder of the new map bundle.")]
+_Out = Annotated[Path, typer.Option(help="Folder of the new map bundle.", callback=folder_of_new_map)]
 _Overwrite = Annotated[bool, typer.Option(help="Replace an existing map bundle.")]
 
 
@@ -207,7 +208,9 @@ def update(
 
 @app.command()
 def push(
-    bundle: Annotated[Path, typer.Argument(help="Folder of a map bundle or of a tiled map.", metavar="MAP")],
+    bundle: Annotated[
+        Path, typer.Argument(help="Folder of a map bundle or of a tiled map.", metavar="MAP", callback=folder_of_map)
+    ],
     url: Annotated[
         str, typer.Argument(help="URL of the map: s3://, gs:// or az://BUCKET/PATH, or file:///FOLDER.", metavar="URL")
     ],
@@ -229,7 +232,10 @@ def push(
 @app.command()
 def pull(
     url: Annotated[str, typer.Argument(help="URL of a map in object storage, or URL@VERSION.", metavar="URL")],
-    out: Annotated[Path, typer.Argument(help="Folder of the map. It must not exist.", metavar="OUT")],
+    out: Annotated[
+        Path,
+        typer.Argument(help="Folder of the map. It must not exist.", metavar="OUT", callback=folder_of_new_map),
+    ],
 ) -> None:
     """Copy a whole map out of object storage.
 
@@ -246,7 +252,9 @@ def pull(
 
 @app.command(name="index")
 def index_command(
-    maps: Annotated[list[Path], typer.Argument(help="Folders of tiled maps.", metavar="MAP...")],
+    maps: Annotated[
+        list[Path], typer.Argument(help="Folders of tiled maps.", metavar="MAP...", callback=folder_of_map)
+    ],
     qdrant: Annotated[
         str, typer.Option(envvar="STREETFIX_QDRANT_URL", help="URL of the server, such as http://127.0.0.1:6333.")
     ],
