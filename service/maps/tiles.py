@@ -529,6 +529,26 @@ def differences(tile: Manifest, of_map: Manifest) -> list[str]:
     return found
 
 
+def needs_search(of_map: Manifest) -> bool:
+    """Return whether a map has so many tiles that a search of the whole map chooses those of a query.
+
+    Args:
+        of_map: manifest of the map.
+    """
+    return len(of_map.tiles) > MOST_SEARCHED
+
+
+def files_unread(of_map: Manifest, *, is_searched_elsewhere: bool) -> frozenset[str]:
+    """Return the files of a map, outside of its tiles, that a service does not read.
+
+    Args:
+        of_map: manifest of the map.
+        is_searched_elsewhere: whether a server chooses the tiles of maps with many tiles, and not their search indices.
+    """
+    is_unread = is_searched_elsewhere and needs_search(of_map)
+    return parts.NOT_SERVED | ({inverted_file.FILE} if is_unread else frozenset())
+
+
 def served_bytes(files: Mapping[str, FileEntry]) -> int:
     """Return the size of the files of a bundle that the service reads, bytes.
 
@@ -636,7 +656,8 @@ class TiledMap(Map):
                 f"{path}: a map of one bundle, not a tiled map; open it with open_map", field=manifest.FILE
             )
         require_shared_cloud(path, read)
-        require_files(path, read, _NEEDED, verify=verify)
+        unread = files_unread(read, is_searched_elsewhere=open_search is not None)
+        require_files(path, read, _NEEDED, unread=unread, verify=verify)
         named = read_streets(path, read)
         tiles = OpenTiles(path, read, named, source or LocalTiles(path), verify=verify, open_bytes=open_bytes)
         search = _search(path, read, open_search, verify=verify)
@@ -849,7 +870,7 @@ def _away_m(
 
 
 def _search(path: Path, read: Manifest, open_search: OpenSearch | None, *, verify: bool) -> PlaceSearch | None:
-    if open_search is not None and len(read.tiles) > MOST_SEARCHED:
+    if open_search is not None and needs_search(read):
         return open_search(read)
     if inverted_file.FILE in read.files:
         return InvertedFile.open(
@@ -859,7 +880,7 @@ def _search(path: Path, read: Manifest, open_search: OpenSearch | None, *, verif
             headings=read.headings,
             verify=verify,
         )
-    if len(read.tiles) > MOST_SEARCHED:
+    if needs_search(read):
         raise damaged_file(path / inverted_file.FILE, f"missing, but a map of more than {MOST_SEARCHED} tiles needs it")
     return None
 

@@ -33,7 +33,7 @@ from service.maps.store.remote import Remote, checked_url, split_version
 from service.maps.store.stored_map import StoredMap, StoreTiles
 from service.maps.store.transfer import pull, push
 from service.maps.tiled_writer import write_tiled
-from service.maps.tiles import TiledMap, TileSource
+from service.maps.tiles import MOST_SEARCHED, TiledMap, TileSource
 from service.maps.writer import write_bundle
 from tests.unit.lattice import as_tile
 
@@ -105,6 +105,19 @@ def same_files(one: Path, other: Path) -> bool:
 
 def versions_in(tiles: Path) -> set[str]:
     return {each.name.partition("-")[0] for each in tiles.iterdir()}
+
+
+class Row:
+    """A search that lists the first views, in place of a server."""
+
+    def __init__(self, of_map: Manifest) -> None:
+        self.views = of_map.counts.views
+
+    def most_similar(self, _: Any, k: int) -> Any:
+        return np.arange(min(k, self.views))
+
+    def shortlist(self, *_: Any) -> Any:
+        raise AssertionError("no query asks for it")
 
 
 def left_over(folder: Path) -> list[Path]:
@@ -652,6 +665,70 @@ class TestVersions:
         push(tmp_path / "own", file_url)
         found.refresh()
         assert read_manifest(version).made_at == later.made_at
+
+    def test_files_that_another_version_has_are_links_unless_they_are_damaged(
+        self, town: Path, url: str, cache: TileCache, content_of: Content, encoder_of: Any, tmp_path: Path
+    ) -> None:
+        push(town, url)
+        fetched: list[int] = []
+
+        @contextmanager
+        def follow(_: str, __: str, size: int) -> Iterator[Any]:
+            fetched.append(size)
+            yield lambda _: None
+
+        found = StoredMap(url, cache, follow)
+        found.refresh()
+        old = found.folder / read_manifest(town).version
+        new = write_tiled_map(tmp_path / "larger", content_of, encoder_of(), tiles=4)
+        push(tmp_path / "larger", url)
+        found.refresh()
+        own = found.folder / new.version
+        same = {name for name, entry in new.files.items() if entry == read_manifest(town).files.get(name)}
+        assert "encoder.onnx" in same
+        assert "places.npy" not in same
+        assert {name for name in new.files if (own / name).samefile(old / name)} == same
+        assert fetched[1] == sum(entry.size for name, entry in new.files.items() if name not in same)
+        TiledMap.open(own, source=found.tiles(own))
+        cache.delete(own)
+        encoder = old / "encoder.onnx"
+        encoder.write_bytes(b"?" + encoder.read_bytes()[1:])
+        again = StoredMap(url, cache)
+        again.refresh()
+        assert not (own / "encoder.onnx").samefile(encoder)
+        TiledMap.open(own, source=again.tiles(own))
+
+    def test_a_search_index_that_a_server_replaces_is_left_out_until_it_is_needed(
+        self, file_url: str, cache: TileCache, content_of: Content, encoder_of: Any, tmp_path: Path
+    ) -> None:
+        made = write_tiled_map(tmp_path / "large", content_of, encoder_of(), tiles=MOST_SEARCHED + 1)
+        push(tmp_path / "large", file_url)
+        for url in (file_url, f"{file_url}@{made.version}"):
+            found = StoredMap(url, cache, is_searched_elsewhere=True)
+            found.refresh()
+            version = found.folder / made.version
+            assert {name for name in made.files if not (version / name).exists()} == {"search.faiss"}
+            opened = TiledMap.open(version, source=found.tiles(version), open_search=Row)
+            assert isinstance(opened.search, Row)
+            with pytest.raises(BundleError, match=r"search\.faiss: missing"):
+                TiledMap.open(version, source=found.tiles(version))
+        for url in (file_url, f"{file_url}@{made.version}"):  # the setting is gone
+            found = StoredMap(url, cache)
+            found.refresh()
+            assert TiledMap.open(version, source=found.tiles(version)).search is not None
+            assert left_over(found.folder) == []
+            assert not list(found.folder.glob(".*"))
+            (version / "search.faiss").unlink()
+
+    def test_the_search_index_of_a_map_of_few_tiles_is_fetched_with_a_server_too(
+        self, town: Path, file_url: str, cache: TileCache
+    ) -> None:
+        push(town, file_url)
+        found = StoredMap(file_url, cache, is_searched_elsewhere=True)
+        found.refresh()
+        assert {each for each in read_manifest(town).files if (found.versions()[0] / each).exists()} == set(
+            read_manifest(town).files
+        ) - NOT_SERVED
 
     def test_a_pinned_version_is_served_although_the_store_has_a_newer_one(
         self, town: Path, url: str, cache: TileCache, content_of: Content, encoder_of: Any, tmp_path: Path
