@@ -197,6 +197,7 @@ class OpenTiles:
         self._street_number = street_numbers(None if of_streets is None else of_streets.streets)
         self._verify, self._limit = verify, open_bytes
         self.opens_ahead = False
+        self._on_change: Callable[[], object] = lambda: None
         self._ahead = Ahead(self._prepare)
         self._prepared_s: dict[int, float] = {}
         self._opened: OrderedDict[int, MapBundle] = OrderedDict()
@@ -222,6 +223,14 @@ class OpenTiles:
         with self._changing:
             return tuple(self._opened)
 
+    def watch(self, callback: Callable[[], object]) -> None:
+        """Report when tiles were opened or closed.
+
+        Args:
+            callback: called by the thread that opened them, afterwards.
+        """
+        self._on_change = callback
+
     def get(self, number: int) -> MapBundle:
         """Return a tile; open it if needed.
 
@@ -242,6 +251,7 @@ class OpenTiles:
             with self._changing:
                 self._opened[number] = made
                 self._close_some()
+            self._on_change()
             return made
 
     def get_all(self, numbers: Sequence[int]) -> list[MapBundle]:
@@ -425,6 +435,7 @@ class OpenTiles:
                     if self._has_room(served_bytes(made.manifest.files)):
                         self._opened[number] = made
                         self._opened.move_to_end(number, last=False)  # no query has used it
+                self._on_change()
         finally:
             self._prepared_s[number] = time.monotonic()
 
