@@ -29,6 +29,8 @@ from service.maps.writer import sha256_of
 
 #: Time between two marks of an open tile as used, s.
 USED_EVERY_S = 60.0
+#: A version that no process has marked as used for this time, s, is deleted by a service that serves one version only.
+UNUSED_S = 7 * 24 * 3600.0
 _UNUSUAL = re.compile(r"[^A-Za-z0-9._-]+")
 
 
@@ -101,6 +103,8 @@ class StoredMap:
         """
         if self.pinned is not None:
             target = self.folder / self.pinned
+            with self._cache.error_context():
+                is_used_now(target)
             if not (target / FILE).exists():
                 manifest, data = manifest_of_version(self._opened(), self.pinned)
                 self._cache.once(target, partial(self._fetch_version, manifest, data))
@@ -141,16 +145,24 @@ class StoredMap:
     def forget(self, keep: Collection[str]) -> None:
         """Delete the folders of other versions than these and the current one. The bound of the cache deletes their tiles.
 
-        With a pinned version this deletes nothing, because services with other versions may share the cache.
+        Services with other pinned versions may share the cache. Each service marks the versions that it keeps as used. With a pinned
+        version, only versions without a mark for ``UNUSED_S`` are deleted.
 
         Args:
             keep: versions.
+
+        Raises:
+            BundleError: the cache cannot be used.
         """
-        if self._version is None:
+        if self.pinned is None and self._version is None:
             return
-        for each in self.versions():
-            if each.name not in {*keep, self._version}:
-                self._cache.delete(each)
+        mine, now_s = {*keep, self.pinned, self._version}, time.time()
+        for each in [found.parent for found in self.folder.glob(f"[!.]*/{FILE}")]:
+            with self._cache.error_context(), suppress(FileNotFoundError):  # another process deletes it
+                if each.name in mine:
+                    is_used_now(each)
+                elif self.pinned is None or now_s - each.stat().st_mtime > UNUSED_S:
+                    self._cache.delete(each)
 
     def _opened(self) -> Remote:
         if self._remote is None:

@@ -3,6 +3,7 @@
 import errno
 import hashlib
 import json
+import os
 import shutil
 import subprocess
 import sys
@@ -30,7 +31,7 @@ from service.maps.store import cache as cache_module
 from service.maps.store import fetch, remote, transfer
 from service.maps.store.cache import TileCache
 from service.maps.store.remote import Remote, checked_url, split_version
-from service.maps.store.stored_map import StoredMap, StoreTiles
+from service.maps.store.stored_map import UNUSED_S, StoredMap, StoreTiles
 from service.maps.store.transfer import pull, push
 from service.maps.tiled_writer import write_tiled
 from service.maps.tiles import MOST_SEARCHED, TiledMap, TileSource
@@ -750,6 +751,31 @@ class TestVersions:
         pinned.forget(())  # the other service needs the new version
         assert {each.name for each in follows.versions()} == {old.version, new.version}
         assert pinned.versions() == [version]
+
+    def test_a_service_with_a_pin_deletes_versions_that_no_process_has_used_for_days(
+        self, town: Path, file_url: str, cache: TileCache, content_of: Content, encoder_of: Any, tmp_path: Path
+    ) -> None:
+        versions = [read_manifest(town).version]
+        push(town, file_url)
+        for tiles in (4, 5):
+            out = tmp_path / str(tiles)
+            versions.append(write_tiled_map(out, content_of, encoder_of(), tiles=tiles).version)
+            push(out, file_url)
+        unused, other, own = [StoredMap(f"{file_url}@{version}", cache) for version in versions]
+        for each in (unused, other, own):
+            each.refresh()
+        long_ago = time.time() - UNUSED_S - 60
+        for version in versions:
+            os.utime(own.folder / version, (long_ago, long_ago))
+        other.refresh()  # another process, which starts and marks its version
+        own.forget([versions[2]])
+        assert {each.parent.name for each in own.folder.glob("*/manifest.json")} == set(versions[1:])
+        os.utime(own.folder / versions[1], (long_ago, long_ago))
+        other.forget([versions[1]])  # a scan marks it again, and finds that of `own` just marked
+        own.forget([versions[2]])
+        assert {each.parent.name for each in own.folder.glob("*/manifest.json")} == set(versions[1:])
+        unused.refresh()  # it comes back when a service needs it
+        assert len(unused.versions()) == 1
 
     def test_a_pinned_version_in_the_cache_needs_no_store(self, town: Path, file_url: str, cache: TileCache) -> None:
         push(town, file_url)
