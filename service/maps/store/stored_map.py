@@ -305,7 +305,7 @@ class StoreTiles:
                 (into / name).parent.mkdir(parents=True, exist_ok=True)
                 os.link(shared[files[name].sha256], into / name)
                 del files[name]
-        self._cache.reserve(into, {name: entry.size for name, entry in files.items()})
+        self._cache.reserve(into, {name: entry.size for name, entry in files.items()} | {FILE: len(data)})
         total = sum(each.size for each in files.values())
         with self._follow("tile", f"{self._remote.url}/{tile.folder}", total) as on_bytes:
             fetch_files(self._remote, f"{tile.folder}/", files, into, on_bytes=on_bytes)

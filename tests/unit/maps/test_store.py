@@ -416,6 +416,53 @@ class TestBound:
         tiles.folder(manifest.tiles[1])
         assert versions_in(folder) == {manifest.tiles[tile].version for tile in (1, 2)}
 
+    def test_tiles_are_counted_only_if_their_size_is_unknown_or_there_is_no_room(
+        self, town: Path, file_url: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        tiles, manifest, folder = self.bounded(town, file_url, tmp_path, 2.5)
+        counted: list[str] = []
+        count = cache_module._Kept.of
+        monkeypatch.setattr(cache_module._Kept, "of", lambda path: counted.append(path.name) or count(path))
+        lock = tmp_path / "cache" / ".lock"
+
+        def counts(tile: int) -> int:
+            """Return how many folders the fetch of a tile counts: those that are there, and that of the new tile."""
+            counted.clear()
+            tiles.folder(manifest.tiles[tile])
+            found = len(counted)
+            assert int(lock.read_text()) == sum(count(each).size for each in folder.iterdir())
+            return found
+
+        assert counts(0) == 1
+        assert counts(1) == 0
+        assert counts(2) == 3  # no room
+        assert len(list(folder.iterdir())) == 2
+        shutil.rmtree(tiles.folder(manifest.tiles[2]))
+        tiles._cache.delete(tmp_path / "cache" / "another-version")
+        assert lock.read_text() == ""
+        assert counts(2) == 2
+        lock.write_text("")  # an earlier release empties the file
+        tiles._cache.delete(tiles.folder(manifest.tiles[1]))
+        assert counts(1) == 2
+
+    def test_a_full_cache_is_freed_a_little_beyond_what_a_tile_needs(
+        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        """A bound of 1,000 bytes, tiles of 10 bytes: every third fetch into the full cache counts, and frees 10 + 20 bytes."""
+        cache = TileCache(tmp_path, 1000)
+        counted, count = [], cache_module._Kept.of
+        monkeypatch.setattr(cache_module._Kept, "of", lambda path: counted.append(path) or count(path))
+        walks = []
+        for number in range(109):
+            counted.clear()
+            cache.once(tmp_path / "town" / "tiles" / str(number), lambda into: cache.reserve(into, {"places.npy": 10}))
+            os.utime(tmp_path / "town" / "tiles" / str(number), (number, number))
+            if counted:
+                walks.append(number)
+        assert walks == [0, 100, 103, 106]
+        left = {int(each.name) for each in (tmp_path / "town" / "tiles").iterdir()}
+        assert left == set(range(9, 109))
+
     def test_a_deleted_tile_stays_readable_where_it_is_open(self, town: Path, file_url: str, tmp_path: Path) -> None:
         tiles, manifest, folder = self.bounded(town, file_url, tmp_path, 1.5)
         opened = MapBundle.open(tiles.folder(manifest.tiles[0]))
