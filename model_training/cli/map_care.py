@@ -90,7 +90,7 @@ def diff(
 ) -> None:
     """Show the changes from one map bundle to another.
 
-    The command compares places, cloud by area, streets, parameters and encoder.
+    The command compares places, cloud by area, streets, parameters and encoder. Of tiled maps it compares tile by tile, without a picture.
 
     \b
     Example:
@@ -127,7 +127,7 @@ def merge(
 ) -> None:
     """Merge two map bundles into one.
 
-    Both have the same frame, encoder and parameters.
+    Both have the same frame, encoder and parameters. A merge that was killed begins again, also of tiled maps.
 
     \b
     Example:
@@ -332,7 +332,10 @@ def _diff_tiles(before: Path, after: Path, *, as_json: bool, picture: Path | Non
     """Print the changes from one tiled map to another."""
     if picture is not None:
         raise typer.BadParameter(
-            "a tiled map has no picture of its changes; give two tiles of the maps", param_hint="--picture"
+            "a tiled map has no picture of its changes; omit the option to see which tiles have changed, and draw one of them: "
+            f"streetfix map diff {before}/tiles/VERSION {after}/tiles/VERSION --picture FILE. `streetfix map info --json` lists column, "
+            "row and version of each tile",
+            param_hint="--picture",
         )
     with bars() as report:
         found = diff_of_tiles(before, after, report=report)
