@@ -151,6 +151,7 @@ def command(
     if tile_m is not None:
         require_tile_edge(tile_m)
         require_engine(engine or "local", workers)
+    told = list[str]()
     with bars() as report, dataset_at(dataset, out) as given:
         opened = in_chosen_frame(given, frame, tiled=tile_m is not None)
         settings = BuildSettings(
@@ -183,5 +184,8 @@ def command(
                 overwrite=overwrite,
                 report=report,
                 warn=lambda text: typer.echo(text, err=True),
+                tell=told.append,
             )
+    for line in told:
+        typer.echo(line)
     Console().print(f"{describe(manifest)}: {out}")
