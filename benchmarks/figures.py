@@ -12,8 +12,10 @@ The third is a format of Python; a percentage gets a space. ``make reports`` wri
 import json
 import re
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
+from benchmarks.country import country_figures
 from benchmarks.provenance import ROOT
 from model_training.calibration.bounds import WRONG_RATE, trials_needed
 from model_training.stock import CALIBRATION
@@ -37,7 +39,32 @@ def stock_calibration() -> Calibration:
     return calibration
 
 
-#: Figures that documents may take from the code.
+def row_of(report: str, name: str) -> float:
+    """Return a figure of a report.
+
+    Args:
+        report: name of the report.
+        name: id of a row, or ``ROW#n``.
+
+    Raises:
+        ValueError: there is no such report or row, or the row has no value.
+    """
+    path = REPORTS / f"{report}.json"
+    if not path.exists():
+        raise ValueError(f"figure: {report}: report not found; use one of reports/*.json, or code")
+    rows = json.loads(path.read_text())["rows"]
+    values = {row["id"]: row["value"] for row in rows} | {f"{row['id']}#n": row.get("n") for row in rows}
+    value: float | None = values.get(name)
+    if value is None:
+        raise ValueError(f"figure: {report} {name}: the report has no such row, or the row has no value")
+    return value
+
+
+def _of_country(name: str) -> float:
+    return country_figures(row_of)[name]
+
+
+#: Figures that documents may take from the code. Those of ``country`` are computed from rows of the reports.
 CODE: dict[str, Callable[[], float]] = {
     "false_accept_rate": lambda: FALSE_ACCEPT_RATE,
     "safe_confidence": lambda: SAFE_CONFIDENCE,
@@ -49,6 +76,7 @@ CODE: dict[str, Callable[[], float]] = {
     "rays_most": lambda: SupportWeights().rays_most,
     "least_false_accept_rate": lambda: stock_calibration().least_false_accept_rate,
     "localized_from_confidence": lambda: stock_calibration().threshold(FALSE_ACCEPT_RATE),
+    **{f"country.{name}": partial(_of_country, name) for name in country_figures(lambda *_: 1.0)},
 }
 
 
@@ -75,15 +103,9 @@ def figure(source: str, name: str, form: str) -> str:
     if source == "code":
         if name not in CODE:
             raise ValueError(f"figure: {name}: unknown figure; choose one of: {', '.join(CODE)}")
-        value: float | None = CODE[name]()
+        value = CODE[name]()
     else:
-        path = REPORTS / f"{source}.json"
-        if not path.exists():
-            raise ValueError(f"figure: {source}: report not found; use one of reports/*.json, or code")
-        rows = json.loads(path.read_text())["rows"]
-        values = {row["id"]: row["value"] for row in rows} | {f"{row['id']}#n": row.get("n") for row in rows}
-        if (value := values.get(name)) is None:
-            raise ValueError(f"figure: {source} {name}: the report has no such row, or the row has no value")
+        value = row_of(source, name)
     shown = format(value, form)
     return shown.replace("%", " %") if form.endswith("%") else shown
 

@@ -18,6 +18,7 @@ from model_training.mapping.settings import BuildSettings
 from model_training.mapping.tiles import require_tile_edge
 from model_training.stock import CALIBRATION, ENCODER
 from model_training.tasks.engines import require_engine
+from service.cli.map_folders import folder_of_map, folder_of_new_map
 from service.retrieval.encoder import Encoder
 
 _DEFAULT = BuildSettings(name="default")
@@ -30,7 +31,7 @@ def command(
             help="Dataset folder with a survey, or its URL in object storage, as s3://BUCKET/PATH (extra `store`)."
         ),
     ],
-    out: Annotated[Path, typer.Option(help="Folder of the map bundle.")],
+    out: Annotated[Path, typer.Option(help="Folder of the map bundle.", callback=folder_of_new_map)],
     encoder: Annotated[
         Path, typer.Option(help="ONNX file of `streetfix export`.  [default: the stock encoder]", show_default=False)
     ] = ENCODER,
@@ -123,6 +124,7 @@ def command(
             "a map takes the frame of that map. The last two need a georeference.  [default: global for a tiled map of a survey with "
             "georeference, else survey]",
             metavar="survey|global|MAP",
+            callback=folder_of_map,
             show_default=False,
         ),
     ] = None,
@@ -149,6 +151,7 @@ def command(
     if tile_m is not None:
         require_tile_edge(tile_m)
         require_engine(engine or "local", workers)
+    told = list[str]()
     with bars() as report, dataset_at(dataset, out) as given:
         opened = in_chosen_frame(given, frame, tiled=tile_m is not None)
         settings = BuildSettings(
@@ -181,5 +184,8 @@ def command(
                 overwrite=overwrite,
                 report=report,
                 warn=lambda text: typer.echo(text, err=True),
+                tell=told.append,
             )
+    for line in told:
+        typer.echo(line)
     Console().print(f"{describe(manifest)}: {out}")

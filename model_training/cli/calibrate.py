@@ -26,6 +26,7 @@ from model_training.datasets.dataset import Dataset, require_map_first
 from model_training.mapping.build import describe
 from model_training.mapping.calibration_file import renew_calibration
 from model_training.stock import CALIBRATION, ENCODER
+from service.cli.map_folders import folder_of_map
 from service.errors import BundleError, DatasetError
 from service.localization.localizer import Localizer
 from service.maps.calibration import Calibration, RigCorrection
@@ -63,7 +64,9 @@ def command(
     map_bundle: Annotated[
         Path | None,
         typer.Option(
-            "--map", help="Map bundle. Learn how its confidence must be corrected for a rig: give --drive or --rig."
+            "--map",
+            help="Map bundle. Learn how its confidence must be corrected for a rig: give --drive or --rig.",
+            callback=folder_of_map,
         ),
     ] = None,
     drive: Annotated[

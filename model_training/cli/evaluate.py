@@ -23,6 +23,7 @@ from model_training.evaluation.raw_range import raw_best_views
 from model_training.evaluation.saved_run import save_run
 from model_training.evaluation.stages import stages_of
 from model_training.evaluation.why_refused import FEW, NO_CAUSE, causes
+from service.cli.map_folders import folder_of_map
 from service.errors import DatasetError
 from service.localization.localizer import Localizer
 from service.maps.map import Map
@@ -62,7 +63,7 @@ _CAPTION = (
 
 
 def command(
-    bundle: Annotated[Path, typer.Argument(help="Map bundle.")],
+    bundle: Annotated[Path, typer.Argument(help="Map bundle.", callback=folder_of_map)],
     dataset: Annotated[Path, typer.Argument(help="Dataset with query sets that have ground truth.")],
     queries: Annotated[
         list[str] | None, typer.Option(help="Query set. Repeat for several.  [default: all with ground truth]")

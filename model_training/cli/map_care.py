@@ -22,6 +22,7 @@ from model_training.mapping.tiled_care import diff_of_tiles, merge_tiled
 from model_training.mapping.update import update_map
 from model_training.mapping.update_tiled import update_tiled
 from model_training.mapping.verify import damage_of
+from service.cli.map_folders import folder_of_map, folder_of_new_map
 from service.errors import BundleError
 from service.maps.calibration import RigCorrection
 from service.maps.manifest import Manifest, read_manifest
@@ -38,9 +39,9 @@ app = typer.Typer(
     help="Maintain map bundles: info, verify, diff, merge, update, push, pull, index.",
 )
 
-_Bundle = Annotated[Path, typer.Argument(help="Folder of a map bundle.")]
+_Bundle = Annotated[Path, typer.Argument(help="Folder of a map bundle.", callback=folder_of_map)]
 _Json = Annotated[bool, typer.Option("--json", help="Print JSON.")]
-_Out = Annotated[Path, typer.Option(help="Folder of the new map bundle.")]
+_Out = Annotated[Path, typer.Option(help="Folder of the new map bundle.", callback=folder_of_new_map)]
 _Overwrite = Annotated[bool, typer.Option(help="Replace an existing map bundle.")]
 
 
@@ -89,7 +90,7 @@ def diff(
 ) -> None:
     """Show the changes from one map bundle to another.
 
-    The command compares places, cloud by area, streets, parameters and encoder.
+    The command compares places, cloud by area, streets, parameters and encoder. Of tiled maps it compares tile by tile, without a picture.
 
     \b
     Example:
@@ -126,7 +127,7 @@ def merge(
 ) -> None:
     """Merge two map bundles into one.
 
-    Both have the same frame, encoder and parameters.
+    Both have the same frame, encoder and parameters. A merge that was killed begins again, also of tiled maps.
 
     \b
     Example:
@@ -207,7 +208,9 @@ def update(
 
 @app.command()
 def push(
-    bundle: Annotated[Path, typer.Argument(help="Folder of a map bundle or of a tiled map.", metavar="MAP")],
+    bundle: Annotated[
+        Path, typer.Argument(help="Folder of a map bundle or of a tiled map.", metavar="MAP", callback=folder_of_map)
+    ],
     url: Annotated[
         str, typer.Argument(help="URL of the map: s3://, gs:// or az://BUCKET/PATH, or file:///FOLDER.", metavar="URL")
     ],
@@ -229,7 +232,10 @@ def push(
 @app.command()
 def pull(
     url: Annotated[str, typer.Argument(help="URL of a map in object storage, or URL@VERSION.", metavar="URL")],
-    out: Annotated[Path, typer.Argument(help="Folder of the map. It must not exist.", metavar="OUT")],
+    out: Annotated[
+        Path,
+        typer.Argument(help="Folder of the map. It must not exist.", metavar="OUT", callback=folder_of_new_map),
+    ],
 ) -> None:
     """Copy a whole map out of object storage.
 
@@ -246,7 +252,9 @@ def pull(
 
 @app.command(name="index")
 def index_command(
-    maps: Annotated[list[Path], typer.Argument(help="Folders of tiled maps.", metavar="MAP...")],
+    maps: Annotated[
+        list[Path], typer.Argument(help="Folders of tiled maps.", metavar="MAP...", callback=folder_of_map)
+    ],
     qdrant: Annotated[
         str, typer.Option(envvar="STREETFIX_QDRANT_URL", help="URL of the server, such as http://127.0.0.1:6333.")
     ],
@@ -324,7 +332,10 @@ def _diff_tiles(before: Path, after: Path, *, as_json: bool, picture: Path | Non
     """Print the changes from one tiled map to another."""
     if picture is not None:
         raise typer.BadParameter(
-            "a tiled map has no picture of its changes; give two tiles of the maps", param_hint="--picture"
+            "a tiled map has no picture of its changes; omit the option to see which tiles have changed, and draw one of them: "
+            f"streetfix map diff {before}/tiles/VERSION {after}/tiles/VERSION --picture FILE. `streetfix map info --json` lists column, "
+            "row and version of each tile",
+            param_hint="--picture",
         )
     with bars() as report:
         found = diff_of_tiles(before, after, report=report)

@@ -14,6 +14,7 @@ from model_training.datasets.survey_part import PartSource, SurveyPart
 from model_training.mapping.build import write_from
 from model_training.mapping.calibration_file import calibration_for
 from model_training.mapping.places import SurveyTraversal
+from model_training.mapping.seams import write_positions
 from model_training.mapping.settings import BuildSettings
 from model_training.mapping.site_check import held_out
 from model_training.mapping.stages import ResumedStages
@@ -83,6 +84,11 @@ class TileTask:
     def scratch(self) -> Path:
         """Folder for scans that come from a store, while the tile is built."""
         return self.folder.with_name(f".{self.folder.name}.scans")
+
+    @property
+    def positions_file(self) -> Path:
+        """File of the aligned positions of the scans, beside the folder of the tile."""
+        return self.folder.with_name(f"{self.folder.name}.positions.npy")
 
     @property
     def is_finished(self) -> bool:
@@ -159,9 +165,11 @@ def build_tile(task: TileTask, share: Share = lambda _: None) -> None:
         kept = np.arange(len(task.numbers))
         dataset.prepare()
         stages = ResumedStages(work, dataset, kept, task.settings, shares_of_stages(task.settings, share), task.part)
+        aligned = stages.poses(task.poses)
+        write_positions(task.positions_file, aligned[:, :3, 3])
         drive = SurveyTraversal(
             dataset,
-            stages.poses(task.poses),
+            aligned,
             kept,
             task.settings,
             encoder,

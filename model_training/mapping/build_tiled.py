@@ -1,6 +1,6 @@
 """Build a tiled map: plan the tiles, build each of them, and put them together."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +12,7 @@ from model_training.mapping.build import Report, require_new
 from model_training.mapping.build_tile import THREADS, CommonValues, TileTask, build_tile, key_of_tile
 from model_training.mapping.calibration_file import calibration_for
 from model_training.mapping.engines import memory_of
+from model_training.mapping.seams import read_positions, seams_of
 from model_training.mapping.settings import BuildSettings
 from model_training.mapping.survey import kept_scans, sampled_survey
 from model_training.mapping.tile_tasks import finish_tiles, folder_of, is_of_tile
@@ -36,6 +37,7 @@ def build_tiled(
     overwrite: bool = False,
     report: Report = lambda *_: None,
     warn: Callable[[str], None] = lambda _: None,
+    tell: Callable[[str], None] = lambda _: None,
 ) -> Manifest:
     """Build a tiled map, or continue a killed build; return the manifest.
 
@@ -52,7 +54,8 @@ def build_tiled(
         workers: number of tiles at the same time; None takes as many as cores and memory allow.
         overwrite: replace an existing map.
         report: progress callback.
-        warn: called with a line of text if a process dies.
+        warn: called with a line of text if a process dies, or if the tiles do not agree.
+        tell: called with a line of text that says how well the tiles agree.
 
     Raises:
         DatasetError: the survey is empty or damaged, or ``tile_m``, ``workers`` or the name is not valid.
@@ -79,10 +82,22 @@ def build_tiled(
             warn=warn,
         )
         report("joining tiles", 0, 1)
+        if settings.align_survey:
+            _compare(tasks, warn, tell)
         tiles = {(task.part.square.column, task.part.square.row): task.folder for task in tasks}
         manifest = write_tiled(out, tiles, tile_m, name=settings.name, overwrite=overwrite)
         report("joining tiles", 1, 1)
         return manifest
+
+
+def _compare(tasks: Sequence[TileTask], warn: Callable[[str], None], tell: Callable[[str], None]) -> None:
+    """Say how far the tiles disagree about the positions of scans that several of them have."""
+    found = [(task.numbers, read_positions(task.positions_file)) for task in tasks]
+    seams = seams_of([(numbers, positions_m) for numbers, positions_m in found if positions_m is not None])
+    if seams is not None:
+        tell(str(seams))
+        if seams.warning is not None:
+            warn(seams.warning)
 
 
 def _tasks(

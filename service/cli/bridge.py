@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import typer
 
 from service.bridge.settings import BridgeSettings, GravitySource, about
+from service.cli.map_folders import folder_of_map
 from service.cli.tls_options import Ca, Cert, Key
 
 if TYPE_CHECKING:
@@ -26,7 +27,9 @@ def _of_several() -> None:
 @app.command("ros2")
 def ros2(
     url: Annotated[str, typer.Option(help=about("url"))] = _DEFAULTS.url,
-    map_bundle: Annotated[Path | None, typer.Option("--map", help=about("map"), show_default=False)] = None,
+    map_bundle: Annotated[
+        Path | None, typer.Option("--map", help=about("map"), show_default=False, callback=folder_of_map)
+    ] = None,
     map_name: Annotated[str | None, typer.Option("--map-name", help=about("map_name"), show_default=False)] = None,
     api_key: Annotated[
         str | None,

@@ -7,10 +7,15 @@ from typing import Annotated
 
 import typer
 
+from service.cli.map_folders import folder_of_map
+
 
 def command(
     bundle: Annotated[
-        Path | None, typer.Option("--map", metavar="BUNDLE", help="Folder of a map bundle.", show_default=False)
+        Path | None,
+        typer.Option(
+            "--map", metavar="BUNDLE", help="Folder of a map bundle.", show_default=False, callback=folder_of_map
+        ),
     ] = None,
     camera: Annotated[
         Path | None, typer.Option(help="JSON file of a camera, as for localize.", show_default=False)

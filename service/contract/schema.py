@@ -836,7 +836,12 @@ class Readiness(BaseModel):
     )
     open_tiles: int = Field(
         0,
-        description="tiles of tiled maps that this process has open; 0 without a tiled map. The first query in a closed tile is slower",
+        description="tiles of tiled maps that this process has open; 0 without a tiled map. The first query in a closed tile is slower. "
+        "The metric `streetfix_open_tiles` counts those of all workers",
+    )
+    cached_tiles: int = Field(
+        0,
+        description="tiles of maps in object storage that are in the cache on the disk, which all workers share; 0 without such a map",
     )
 
 

@@ -63,17 +63,18 @@ class Georeference:
         Args:
             position_m: x, y, z in the map frame, metres.
         """
-        x, y, z = (self._origin() + self._east_north_up().T @ position_m).tolist()
-        flat = float(np.hypot(x, y))
-        latitude = float(np.arctan2(z, flat * (1 - _E2)))
-        height = 0.0
-        for _ in range(10):
-            n = _A / np.sqrt(1 - _E2 * np.sin(latitude) ** 2)
-            # The division needs the larger of cosine and sine. The cosine is 0 at a pole, the sine is 0 at the equator.
-            cosine, sine = np.cos(latitude), np.sin(latitude)
-            height = float(flat / cosine - n if cosine > abs(sine) else z / sine - n * (1 - _E2))
-            latitude = float(np.arctan2(z, flat * (1 - _E2 * n / (n + height))))
-        return float(np.rad2deg(latitude)), float(np.rad2deg(np.arctan2(y, x))), height
+        latitude_deg, longitude_deg, height_m = _geodetic(
+            self._origin() + self._east_north_up().T @ position_m
+        ).tolist()
+        return latitude_deg, longitude_deg, height_m
+
+    def to_earth_all(self, positions_m: Float64[NDArray[np.float64], "*n 3"]) -> Float64[NDArray[np.float64], "*n 3"]:
+        """Return latitude (degrees), longitude (degrees) and height above the ellipsoid (m) of many map positions.
+
+        Args:
+            positions_m: x, y, z of each in the map frame, metres.
+        """
+        return _geodetic(self._origin() + positions_m @ self._east_north_up())
 
     def R_enu_map(self, position_m: Float64[NDArray[np.float64], "3"]) -> Float64[NDArray[np.float64], "3 3"]:
         """Return the rotation from map axes to east, north and up at a map position.
@@ -125,3 +126,19 @@ def _earth_centred(latitude_deg: float, longitude_deg: float, height_m: float) -
     n = _A / np.sqrt(1 - _E2 * np.sin(b) ** 2)
     flat = (n + height_m) * np.cos(b)
     return np.array([flat * np.cos(l), flat * np.sin(l), (n * (1 - _E2) + height_m) * np.sin(b)])
+
+
+def _geodetic(centred_m: Float64[NDArray[np.float64], "*n 3"]) -> Float64[NDArray[np.float64], "*n 3"]:
+    """Return latitude (degrees), longitude (degrees) and height (m) of earth-centred positions."""
+    x, y, z = centred_m[..., 0], centred_m[..., 1], centred_m[..., 2]
+    flat = np.hypot(x, y)
+    latitude, height = np.arctan2(z, flat * (1 - _E2)), np.zeros_like(flat)
+    for _ in range(10):
+        n = _A / np.sqrt(1 - _E2 * np.sin(latitude) ** 2)
+        # The division needs the larger of cosine and sine. The cosine is 0 at a pole, the sine is 0 at the equator.
+        cosine, sine = np.cos(latitude), np.sin(latitude)
+        by_cosine = cosine > abs(sine)
+        quotient = np.where(by_cosine, flat, z) / np.where(by_cosine, cosine, sine)
+        height = quotient - np.where(by_cosine, n, n * (1 - _E2))
+        latitude = np.arctan2(z, flat * (1 - _E2 * n / (n + height)))
+    return np.stack([np.rad2deg(latitude), np.rad2deg(np.arctan2(y, x)), height], axis=-1)

@@ -154,10 +154,11 @@ class Servicer(LocalizationServiceServicer):
             request: names the map, or none for all.
             context: of the call.
         """
-        with self._answering("GetCoverage", context):
+        with self._answering("GetCoverage", context), self._engine.memory.hold() as hold:
             registry = self._engine.registry
             localizers = [registry.get(request.map)] if request.HasField("map") else list(registry)
-            return pb.GetCoverageResponse(geojson=coverage_geojson([localizer.bundle for localizer in localizers]))
+            collection = coverage_geojson([localizer.bundle for localizer in localizers], hold)
+            return pb.GetCoverageResponse(geojson=collection)
 
     def _localize(self, request: pb.LocalizeRequest, span: RequestSpan) -> pb.LocalizeResponse:
         query = query_from(request_from(request), rgb=request.rgb, depth=request.depth)

@@ -1,7 +1,7 @@
 """Read and check the files of a map bundle. Every error names the file and the remedy."""
 
 import json
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
@@ -19,13 +19,21 @@ from service.maps.writer import sha256_of
 _HASHING_THREADS = 4
 
 
-def require_files(path: Path, manifest: Manifest, needed: Iterable[str], *, verify: bool) -> None:
+def require_files(
+    path: Path,
+    manifest: Manifest,
+    needed: Iterable[str],
+    *,
+    unread: Collection[str] = parts.NOT_SERVED,
+    verify: bool,
+) -> None:
     """Check that the files of a bundle are there, and that they are those of the manifest. Files that the service does not read may lack.
 
     Args:
         path: the bundle's folder.
         manifest: its manifest.
         needed: files that the manifest must list.
+        unread: files that this service does not read. They may be missing, and are not hashed.
         verify: compare the hash of every file that the service reads. Sizes are always compared.
 
     Raises:
@@ -37,7 +45,7 @@ def require_files(path: Path, manifest: Manifest, needed: Iterable[str], *, veri
     compared: list[tuple[Path, FileEntry]] = []
     for name, entry in manifest.files.items():
         file = path / name
-        if name in parts.NOT_SERVED and not file.exists():
+        if name in unread and not file.exists():
             continue
         if not file.is_file() or not file.resolve().is_relative_to(path.resolve()):
             raise damaged_file(file, "missing, or outside the bundle")
@@ -47,7 +55,7 @@ def require_files(path: Path, manifest: Manifest, needed: Iterable[str], *, veri
             raise _unreadable(file, error) from error
         if size != entry.size:
             raise damaged_file(file, f"{size} bytes instead of {entry.size}")
-        if verify and name not in parts.NOT_SERVED:
+        if verify and name not in unread:
             compared.append((file, entry))
     _compare_hashes(compared)
     if manifest.files[parts.ENCODER_FILE].sha256 != manifest.encoder_sha256:

@@ -197,6 +197,7 @@ class OpenTiles:
         self._street_number = street_numbers(None if of_streets is None else of_streets.streets)
         self._verify, self._limit = verify, open_bytes
         self.opens_ahead = False
+        self._on_change: Callable[[], object] = lambda: None
         self._ahead = Ahead(self._prepare)
         self._prepared_s: dict[int, float] = {}
         self._opened: OrderedDict[int, MapBundle] = OrderedDict()
@@ -222,6 +223,14 @@ class OpenTiles:
         with self._changing:
             return tuple(self._opened)
 
+    def watch(self, callback: Callable[[], object]) -> None:
+        """Report when tiles were opened or closed.
+
+        Args:
+            callback: called by the thread that opened them, afterwards.
+        """
+        self._on_change = callback
+
     def get(self, number: int) -> MapBundle:
         """Return a tile; open it if needed.
 
@@ -242,6 +251,7 @@ class OpenTiles:
             with self._changing:
                 self._opened[number] = made
                 self._close_some()
+            self._on_change()
             return made
 
     def get_all(self, numbers: Sequence[int]) -> list[MapBundle]:
@@ -425,6 +435,7 @@ class OpenTiles:
                     if self._has_room(served_bytes(made.manifest.files)):
                         self._opened[number] = made
                         self._opened.move_to_end(number, last=False)  # no query has used it
+                self._on_change()
         finally:
             self._prepared_s[number] = time.monotonic()
 
@@ -527,6 +538,26 @@ def differences(tile: Manifest, of_map: Manifest) -> list[str]:
     if tile.counts.descriptor_size != of_map.counts.descriptor_size:
         found.append("counts.descriptor_size")
     return found
+
+
+def needs_search(of_map: Manifest) -> bool:
+    """Return whether a map has so many tiles that a search of the whole map chooses those of a query.
+
+    Args:
+        of_map: manifest of the map.
+    """
+    return len(of_map.tiles) > MOST_SEARCHED
+
+
+def files_unread(of_map: Manifest, *, is_searched_elsewhere: bool) -> frozenset[str]:
+    """Return the files of a map, outside of its tiles, that a service does not read.
+
+    Args:
+        of_map: manifest of the map.
+        is_searched_elsewhere: whether a server chooses the tiles of maps with many tiles, and not their search indices.
+    """
+    is_unread = is_searched_elsewhere and needs_search(of_map)
+    return parts.NOT_SERVED | ({inverted_file.FILE} if is_unread else frozenset())
 
 
 def served_bytes(files: Mapping[str, FileEntry]) -> int:
@@ -636,7 +667,8 @@ class TiledMap(Map):
                 f"{path}: a map of one bundle, not a tiled map; open it with open_map", field=manifest.FILE
             )
         require_shared_cloud(path, read)
-        require_files(path, read, _NEEDED, verify=verify)
+        unread = files_unread(read, is_searched_elsewhere=open_search is not None)
+        require_files(path, read, _NEEDED, unread=unread, verify=verify)
         named = read_streets(path, read)
         tiles = OpenTiles(path, read, named, source or LocalTiles(path), verify=verify, open_bytes=open_bytes)
         search = _search(path, read, open_search, verify=verify)
@@ -849,7 +881,7 @@ def _away_m(
 
 
 def _search(path: Path, read: Manifest, open_search: OpenSearch | None, *, verify: bool) -> PlaceSearch | None:
-    if open_search is not None and len(read.tiles) > MOST_SEARCHED:
+    if open_search is not None and needs_search(read):
         return open_search(read)
     if inverted_file.FILE in read.files:
         return InvertedFile.open(
@@ -859,7 +891,7 @@ def _search(path: Path, read: Manifest, open_search: OpenSearch | None, *, verif
             headings=read.headings,
             verify=verify,
         )
-    if len(read.tiles) > MOST_SEARCHED:
+    if needs_search(read):
         raise damaged_file(path / inverted_file.FILE, f"missing, but a map of more than {MOST_SEARCHED} tiles needs it")
     return None
 

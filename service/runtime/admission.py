@@ -280,15 +280,17 @@ class Hold:
             self._users += 1
         work.add_done_callback(lambda _: self._one_less())
 
-    def leave_with(self, owner: Any) -> None:
-        """Transfer the bytes to an object. They are released when the object is deleted.
+    def leave_with(self, owner: Any, count: int | None = None) -> None:
+        """Transfer bytes to an object. They are released when the object is deleted.
 
         Args:
             owner: any object that supports weak references.
+            count: how many of the reserved bytes; None for all.
         """
-        if self.bytes:
-            weakref.finalize(owner, self._budget.give_back_later, self.bytes).atexit = False
-        self.bytes = 0
+        moved = self.bytes if count is None else count
+        if moved:
+            weakref.finalize(owner, self._budget.give_back_later, moved).atexit = False
+        self.bytes -= moved
 
     def _one_less(self) -> None:
         with self._lock:

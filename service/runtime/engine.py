@@ -367,7 +367,8 @@ def watcher_of(registry: MapRegistry, settings: Settings, tiles: TileMetrics) ->
         cache = TileCache(settings.tile_cache or default_folder(), settings.tile_cache_bytes)
         cache.clean()
         follow = partial(FetchLog, on_fetched=tiles.fetched)
-        stored = [StoredMap(each, cache, follow, tiles.requested) for each in urls]
+        elsewhere = settings.qdrant_url is not None
+        stored = [StoredMap(each, cache, follow, tiles.requested, is_searched_elsewhere=elsewhere) for each in urls]
     paths = [each for each in settings.maps if isinstance(each, Path)]
     return MapWatcher(
         registry,

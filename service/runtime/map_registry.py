@@ -2,7 +2,7 @@
 
 import logging
 import threading
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -77,6 +77,7 @@ class MapRegistry:
         self.refused: tuple[Refused, ...] = ()
         self._open: dict[Key, Localizer] = {}
         self._changing = threading.Lock()
+        self._on_change: Callable[[Sequence[Localizer]], object] = lambda _: None
         self._view = _View(Table(), {})
         for localizer in localizers:
             bundle = localizer.bundle
@@ -104,6 +105,16 @@ class MapRegistry:
                 f"{where}: {_NO_MANIFEST}" if paths else "no map bundle given; give a folder that build-map wrote"
             )
         return cls([Localizer.open(open_map(path), provider=provider) for path in bundles], provider=provider)
+
+    def watch(self, callback: Callable[[Sequence[Localizer]], object]) -> None:
+        """Report the mounted versions now and after every change.
+
+        Args:
+            callback: called with all mounted versions of all maps. It must not use the registry.
+        """
+        with self._changing:
+            self._on_change = callback
+            self._renew()
 
     def __len__(self) -> int:
         return len(self._maps())
@@ -246,6 +257,7 @@ class MapRegistry:
             elif offers is not None:  # must not happen: a worker joins only when it has all of them
                 _log.error("map_lacking name=%s version=%s", name, known.serving)
         self._view = _View(table, maps)
+        self._on_change([localizer for each in maps.values() for localizer in each.versions])
 
 
 def version_of(manifest: Manifest) -> MapVersion:

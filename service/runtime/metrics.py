@@ -1,7 +1,7 @@
 """Prometheus metrics of the service. They hold figures of requests, never their content."""
 
 import os
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 
@@ -19,7 +19,7 @@ from service.localization.answer import Answer, Timings
 from service.maps.map import Map
 from service.runtime.admission import Admission, MemoryBudget
 from service.runtime.map_registry import MOST_REFUSED, MapRegistry
-from service.runtime.tile_metrics import TileMetrics
+from service.runtime.tile_metrics import OpenTilesGauge, TileMetrics
 from service.timing import STAGES
 
 CONTENT_TYPE = CONTENT_TYPE_LATEST
@@ -64,6 +64,10 @@ class Metrics:
         admission.watch(working.set, waiting.set)
         held = self._gauge("streetfix_request_memory_bytes", "Memory that is reserved for requests now.")
         memory.watch(held.set)
+        self._open_tiles = OpenTilesGauge(
+            self._gauge("streetfix_open_tiles", "Open tiles of each tiled map, of all its versions.", ["map"])
+        )
+        maps.watch(self._open_tiles.mounted)
         self._gauge("streetfix_request_memory_limit_bytes", "Memory that may be reserved for requests.").set(
             memory.limit
         )
@@ -114,9 +118,9 @@ class Metrics:
             "streetfix_batch_size", "Requests of a batch.", buckets=(1, 2, 4, 8, 16), registry=self._registry
         )
 
-    def _gauge(self, name: str, what: str) -> Gauge:
+    def _gauge(self, name: str, what: str, labels: Sequence[str] = ()) -> Gauge:
         """Add a gauge. With several processes its value is the sum over the living ones."""
-        return Gauge(name, what, registry=self._registry, multiprocess_mode="livesum")
+        return Gauge(name, what, labels, registry=self._registry, multiprocess_mode="livesum")
 
     def answered(self, answer: Answer, bundle: Map, *, frames: int) -> None:
         """Count an answer and its stages.
@@ -219,16 +223,10 @@ class _Maps(Collector):
         maps = GaugeMetricFamily(
             "streetfix_map", "Mounted maps; the value is their number of places.", labels=["map", "version"]
         )
-        tiles = GaugeMetricFamily(
-            "streetfix_open_tiles", "Open tiles of each tiled map in this worker.", labels=["map"]
-        )
         for localizer in self._maps:
             manifest = localizer.bundle.manifest
             maps.add_metric([manifest.name, manifest.version], manifest.counts.places)
-            if manifest.tiles:
-                tiles.add_metric([manifest.name], localizer.bundle.open_tiles)
         yield maps
-        yield tiles
         cached = GaugeMetricFamily(
             "streetfix_cached_tiles",
             "Tiles of each tiled map from object storage in the cache on the disk, which workers share.",

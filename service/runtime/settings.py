@@ -112,7 +112,7 @@ class Settings(BaseSettings):
         OPEN_BYTES,
         ge=1_000_000,
         le=2**60,
-        description="bound of the tiles of a tiled map that a worker has open; the least recently used ones are closed",
+        description="bound of the tiles that a worker has open of each version of a tiled map; the least recently used ones are closed",
     )
     qdrant_url: str | None = Field(
         None,

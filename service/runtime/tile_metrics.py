@@ -1,6 +1,12 @@
-"""Prometheus metrics of the cache of maps in object storage: requests of tiles, and fetches."""
+"""Prometheus metrics of tiled maps: open tiles, requests of tiles in object storage, and fetches."""
 
-from prometheus_client import CollectorRegistry, Counter, Histogram
+import threading
+from collections.abc import Sequence
+
+from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram
+
+from service.localization.localizer import Localizer
+from service.maps.tiles import TiledMap
 
 #: Fetches take from milliseconds to minutes.
 _SECONDS = (0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 20.0, 60.0, 120.0, 300.0)
@@ -60,3 +66,39 @@ class TileMetrics:
         """
         self._seconds.labels(kind).observe(seconds)
         self._bytes.labels(kind).inc(size)
+
+
+class OpenTilesGauge:
+    """Keeps a gauge at the number of open tiles of each map. Threads may share it.
+
+    Args:
+        gauge: with the label ``map``.
+    """
+
+    def __init__(self, gauge: Gauge) -> None:
+        self._gauge, self._counting = gauge, threading.Lock()
+        self._mounted: list[TiledMap] = []
+        self._named: set[str] = set()
+
+    def mounted(self, localizers: Sequence[Localizer]) -> None:
+        """Count the tiles of these maps from now on, and no others.
+
+        Args:
+            localizers: all mounted versions of all maps.
+        """
+        tiled = [each.bundle for each in localizers if isinstance(each.bundle, TiledMap)]
+        with self._counting:
+            self._mounted = tiled
+        for each in tiled:
+            each.tiles.watch(self.count)
+        self.count()
+
+    def count(self) -> None:
+        """Set the gauge to the present numbers."""
+        with self._counting:
+            totals = dict.fromkeys(self._named, 0)  # of a map that is gone: several processes cannot remove a label
+            for each in self._mounted:
+                totals[each.name] = totals.get(each.name, 0) + each.open_tiles
+            self._named = set(totals)
+            for name, total in totals.items():
+                self._gauge.labels(name).set(total)

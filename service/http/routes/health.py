@@ -46,6 +46,7 @@ def router_for(engine: Engine, version: str) -> APIRouter:
         return schema.Readiness(
             refused=[schema.RefusedBundle(bundle=each.bundle, reason=each.reason) for each in refused],
             open_tiles=sum(localizer.bundle.open_tiles for localizer in engine.registry),
+            cached_tiles=sum(engine.watcher.cached_tiles().values()),
         )
 
     @router.get(

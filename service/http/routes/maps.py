@@ -34,7 +34,8 @@ _COVERAGE: dict[int | str, dict[str, Any]] = {
         "description": "A GeoJSON FeatureCollection with one MultiPolygon per map. Coordinates are longitude and latitude if the map is "
         "georeferenced, else metres of the map frame. `properties.frame` names the frame.",
         "content": {GEOJSON: {"schema": {"type": "object"}}},
-    }
+    },
+    **problems(413, 503),
 }
 
 
@@ -95,6 +96,10 @@ def router_for(engine: Engine) -> APIRouter:
         responses=_COVERAGE,
     )
     def get_coverage() -> Response:
-        return Response(coverage_geojson([localizer.bundle for localizer in engine.registry]), media_type=GEOJSON)
+        with engine.memory.hold() as hold:
+            collection = coverage_geojson([localizer.bundle for localizer in engine.registry], hold)
+            response = Response(collection, media_type=GEOJSON)
+            hold.leave_with(response)
+        return response
 
     return router

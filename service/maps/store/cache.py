@@ -16,13 +16,17 @@ import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
+from io import FileIO
 from pathlib import Path
 
 from service.errors import BundleError
 from service.maps.manifest import TILES_FOLDER
 
 _PARTIAL, _DELETED = ".partial", ".deleted"
+#: Its lock guards the bound. Its content is the size of all tiles, never too small; or nothing, if the tiles must be counted.
 _LOCK = ".lock"
+#: Share of the bound that is freed beyond what a new tile needs. Otherwise each tile in a full cache would count all tiles again.
+_SPARE_SHARE = 0.02
 
 
 def default_folder() -> Path:
@@ -96,8 +100,12 @@ class TileCache:
                 "STREETFIX_TILE_CACHE_BYTES to several times the size of a tile",
                 field="tile_cache_bytes",
             )
-        with self.error_context(), self._alone():
-            self._make_room(needed)
+        with self.error_context(), self._alone() as total:
+            known = total.get()
+            if known is None or known + needed > self.most_bytes:
+                total.set(None)
+                known = self._make_room(needed)
+            total.set(known + needed)
             for name, size in sizes.items():
                 file = partial / name
                 file.parent.mkdir(parents=True, exist_ok=True)
@@ -112,29 +120,43 @@ class TileCache:
 
         Args:
             folder: of a tile or of a version.
+
+        Raises:
+            BundleError: the file system reports an error.
         """
+        with self.error_context():
+            self._delete(folder)
+            if self.folder.is_dir():
+                with self._alone() as total:  # tiles may be the last to have a link to a file of a version
+                    total.set(None)
+
+    def _delete(self, folder: Path) -> None:
         doomed = folder.parent / f".{folder.name}.{os.getpid()}-{time.monotonic_ns()}{_DELETED}"
-        with self.error_context(), suppress(FileNotFoundError):  # another process deletes it too
+        with suppress(FileNotFoundError):  # another process deletes it too
             folder.rename(doomed)
             shutil.rmtree(doomed, ignore_errors=True)
 
-    def _make_room(self, needed: int) -> None:
+    def _make_room(self, needed: int) -> int:
+        """Count all tiles, and delete the least recently used ones until there is room; return the size of the others."""
         tiles = [_Kept.of(each) for each in self.folder.glob(f"*/{TILES_FOLDER}/*") if not each.name.endswith(_DELETED)]
-        free = self.most_bytes - sum(each.size for each in tiles)
+        kept, most = sum(each.size for each in tiles), self.most_bytes - needed
+        if kept <= most:
+            return kept
         for oldest in sorted(tiles, key=lambda each: each.used):
-            if free >= needed:
-                return
+            if kept <= most - _SPARE_SHARE * self.most_bytes:
+                break
             if oldest.path.name.startswith("."):  # being fetched
                 continue
-            self.delete(oldest.path)
-            free += oldest.size
+            self._delete(oldest.path)
+            kept -= oldest.size
+        return kept
 
     @contextmanager
-    def _alone(self) -> Iterator[None]:
+    def _alone(self) -> Iterator["_Total"]:
         """Let no other process delete or reserve inside the context."""
-        with (self.folder / _LOCK).open("w") as lock:
+        with os.fdopen(os.open(self.folder / _LOCK, os.O_RDWR | os.O_CREAT, 0o644), "r+b", buffering=0) as lock:
             fcntl.flock(lock, fcntl.LOCK_EX)
-            yield
+            yield _Total(lock)
 
     @contextmanager
     def error_context(self) -> Iterator[None]:
@@ -153,6 +175,26 @@ class TileCache:
                 "STREETFIX_TILE_CACHE to another folder",
                 field="tile_cache",
             ) from error
+
+
+class _Total:
+    """The size of all tiles, in the content of the lock. An earlier release empties it, so the tiles are then counted again."""
+
+    def __init__(self, file: FileIO) -> None:
+        self._file = file
+
+    def get(self) -> int | None:
+        """Return the bytes; None if they are unknown."""
+        self._file.seek(0)
+        text = self._file.read()
+        return int(text) if text.isdigit() else None
+
+    def set(self, size: int | None) -> None:
+        """Store the bytes; None if they are unknown."""
+        self._file.seek(0)
+        self._file.truncate()
+        if size is not None:
+            self._file.write(b"%d" % size)
 
 
 @dataclass(frozen=True, slots=True)

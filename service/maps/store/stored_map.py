@@ -3,6 +3,7 @@
 import hashlib
 import os
 import re
+import shutil
 import time
 from collections.abc import Callable, Collection, Mapping
 from contextlib import AbstractContextManager, nullcontext, suppress
@@ -12,7 +13,7 @@ from pathlib import Path
 from service.errors import BundleError
 from service.maps.checked_tiles import Checked, CheckedTiles, mark_of
 from service.maps.content import NOT_SERVED
-from service.maps.manifest import FILE, TILES_FOLDER, Manifest, Tile, parsed_manifest, read_manifest
+from service.maps.manifest import FILE, TILES_FOLDER, FileEntry, Manifest, Tile, parsed_manifest, read_manifest
 from service.maps.store.cache import TileCache, is_used_now
 from service.maps.store.fetch import (
     OnBytes,
@@ -23,9 +24,13 @@ from service.maps.store.fetch import (
     tile_manifest,
 )
 from service.maps.store.remote import Remote, split_version
+from service.maps.tiles import files_unread
+from service.maps.writer import sha256_of
 
 #: Time between two marks of an open tile as used, s.
 USED_EVERY_S = 60.0
+#: A version that no process has marked as used for this time, s, is deleted by a service that serves one version only.
+UNUSED_S = 7 * 24 * 3600.0
 _UNUSUAL = re.compile(r"[^A-Za-z0-9._-]+")
 
 
@@ -49,13 +54,14 @@ class StoredMap:
 
     ``folder`` has a folder for each version of the map, with ``manifest.json`` and the shared files. Its folder ``tiles`` has the tiles
     that ``StoreTiles`` has fetched. All versions share them. A map without tiles is fetched whole. Files that the service does not read
-    are left out.
+    are left out. A file that another version in the cache has is a hard link.
 
     Args:
         url: such as ``s3://bucket/maps/town``, or with a version ``s3://bucket/maps/town@3f9c2a7be01d4586``.
         cache: the cache.
         follow: follows the fetches.
         on_request: takes note of the requests of tiles.
+        is_searched_elsewhere: whether a server chooses the tiles of maps with many tiles. Then their search indices are left out.
 
     Attributes:
         url: as given, without a final slash and without the version.
@@ -67,8 +73,15 @@ class StoredMap:
     """
 
     def __init__(
-        self, url: str, cache: TileCache, follow: Follow = _unseen, on_request: OnRequest = lambda *_: None
+        self,
+        url: str,
+        cache: TileCache,
+        follow: Follow = _unseen,
+        on_request: OnRequest = lambda *_: None,
+        *,
+        is_searched_elsewhere: bool = False,
     ) -> None:
+        self._is_searched_elsewhere = is_searched_elsewhere
         self.url, self.pinned = split_version(url)
         self._cache, self._follow, self._on_request = cache, follow, on_request
         self._checked = CheckedTiles()  # of all versions
@@ -89,9 +102,13 @@ class StoredMap:
             ExtraMissingError: obstore is not installed.
         """
         if self.pinned is not None:
-            if not (self.folder / self.pinned / FILE).exists():
+            target = self.folder / self.pinned
+            with self._cache.error_context():
+                is_used_now(target)
+            if not (target / FILE).exists():
                 manifest, data = manifest_of_version(self._opened(), self.pinned)
-                self._cache.once(self.folder / self.pinned, partial(self._fetch_version, manifest, data))
+                self._cache.once(target, partial(self._fetch_version, manifest, data))
+            self._complete(target)
             return
         remote = self._opened()
         found = remote.read(FILE, unless=self._etag)
@@ -106,6 +123,7 @@ class StoredMap:
                 newer = target / f".{FILE}.{os.getpid()}"
                 newer.write_bytes(data)
                 newer.replace(target / FILE)
+        self._complete(target)
         self._etag, self._version = etag, manifest.version
 
     def versions(self) -> list[Path]:
@@ -127,16 +145,24 @@ class StoredMap:
     def forget(self, keep: Collection[str]) -> None:
         """Delete the folders of other versions than these and the current one. The bound of the cache deletes their tiles.
 
-        With a pinned version this deletes nothing, because services with other versions may share the cache.
+        Services with other pinned versions may share the cache. Each service marks the versions that it keeps as used. With a pinned
+        version, only versions without a mark for ``UNUSED_S`` are deleted.
 
         Args:
             keep: versions.
+
+        Raises:
+            BundleError: the cache cannot be used.
         """
-        if self._version is None:
+        if self.pinned is None and self._version is None:
             return
-        for each in self.versions():
-            if each.name not in {*keep, self._version}:
-                self._cache.delete(each)
+        mine, now_s = {*keep, self.pinned, self._version}, time.time()
+        for each in [found.parent for found in self.folder.glob(f"[!.]*/{FILE}")]:
+            with self._cache.error_context(), suppress(FileNotFoundError):  # another process deletes it
+                if each.name in mine:
+                    is_used_now(each)
+                elif self.pinned is None or now_s - each.stat().st_mtime > UNUSED_S:
+                    self._cache.delete(each)
 
     def _opened(self) -> Remote:
         if self._remote is None:
@@ -144,11 +170,67 @@ class StoredMap:
         return self._remote
 
     def _fetch_version(self, manifest: Manifest, data: bytes, into: Path) -> None:
-        remote = self._opened()
-        files = shared_files(manifest, f"{self.url}/{FILE}", leave_out=NOT_SERVED)
+        self._fetch_files(manifest, self._wanted(manifest), into)
+        (into / FILE).write_bytes(data)
+
+    def _complete(self, version: Path) -> None:
+        """Fetch the files of a version that a service without use for them has left out."""
+        manifest = read_manifest(version)
+        if all((version / name).exists() for name in self._wanted(manifest)):
+            return
+
+        def fetch(into: Path) -> None:
+            files = self._wanted(manifest)
+            self._fetch_files(
+                manifest, {name: entry for name, entry in files.items() if not (version / name).exists()}, into
+            )
+
+        added = version.parent / f".{version.name}.added"
+        self._cache.once(added, fetch)
+        with self._cache.error_context():
+            for each in [file for file in added.rglob("*") if file.is_file()]:
+                target = version / each.relative_to(added)
+                target.parent.mkdir(parents=True, exist_ok=True)
+                with suppress(FileNotFoundError):  # another process has moved it
+                    each.replace(target)
+            shutil.rmtree(added, ignore_errors=True)
+
+    def _wanted(self, manifest: Manifest) -> dict[str, FileEntry]:
+        """Return the files of a version, outside of its tiles, that the service reads."""
+        unread = files_unread(manifest, is_searched_elsewhere=self._is_searched_elsewhere)
+        return shared_files(manifest, f"{self.url}/{FILE}", leave_out=unread)
+
+    def _fetch_files(self, manifest: Manifest, files: dict[str, FileEntry], into: Path) -> None:
+        """Link the files that another version in the cache has, and fetch the others."""
+        remote, known = self._opened(), self._known_by_hash()
+        for name, entry in list(files.items()):
+            if entry.sha256 in known and _link(known[entry.sha256], entry, into / name):
+                del files[name]
         with self._follow("map", self.url, sum(each.size for each in files.values())) as on_bytes:
             fetch_files(remote, shared_prefix(remote, manifest), files, into, on_bytes=on_bytes)
-        (into / FILE).write_bytes(data)
+
+    def _known_by_hash(self) -> dict[str, Path]:
+        """Return the shared files of all versions in the cache by their hash."""
+        known: dict[str, Path] = {}
+        for found in self.folder.glob(f"[!.]*/{FILE}"):
+            with suppress(BundleError):  # of another format, or being deleted
+                files = read_manifest(found.parent).files
+                known |= {
+                    entry.sha256: found.parent / name for name, entry in files.items() if (found.parent / name).exists()
+                }
+        return known
+
+
+def _link(known: Path, entry: FileEntry, target: Path) -> bool:
+    """Link a file of the cache if it has the content that is expected; return whether it has."""
+    try:
+        if known.stat().st_size != entry.size or sha256_of(known) != entry.sha256:  # damaged on the disk
+            return False
+        target.parent.mkdir(parents=True, exist_ok=True)
+        os.link(known, target)
+    except OSError:  # left out or being deleted, or a file system without hard links
+        return False
+    return True
 
 
 class StoreTiles:
@@ -223,7 +305,7 @@ class StoreTiles:
                 (into / name).parent.mkdir(parents=True, exist_ok=True)
                 os.link(shared[files[name].sha256], into / name)
                 del files[name]
-        self._cache.reserve(into, {name: entry.size for name, entry in files.items()})
+        self._cache.reserve(into, {name: entry.size for name, entry in files.items()} | {FILE: len(data)})
         total = sum(each.size for each in files.values())
         with self._follow("tile", f"{self._remote.url}/{tile.folder}", total) as on_bytes:
             fetch_files(self._remote, f"{tile.folder}/", files, into, on_bytes=on_bytes)

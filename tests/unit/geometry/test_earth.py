@@ -137,3 +137,10 @@ def test_the_ends_of_the_ranges_are_places():
     for latitude_deg in (-90.0, 90.0):
         for longitude_deg in (-180.0, 180.0):
             assert np.isfinite(Georeference(latitude_deg, longitude_deg).to_map(0.0, 0.0, 0.0)).all()
+
+
+@given(origins, st.lists(positions, min_size=1, max_size=5))
+def test_many_positions_are_converted_as_one_by_one(origin, places):
+    found = origin.to_earth_all(np.stack(places))
+    np.testing.assert_allclose(found, [origin.to_earth(place) for place in places], rtol=0, atol=1e-7)
+    np.testing.assert_array_equal(origin.to_earth_all(np.stack(places)[None]), found[None])

@@ -35,7 +35,7 @@ def test_the_version_says_which_maps_are_served(client: httpx.Client) -> None:
 
 def test_a_service_with_a_map_lives_and_is_ready(client: httpx.Client) -> None:
     assert client.get("/livez").json() == {"status": "ok"}
-    assert client.get("/readyz").json() == {"status": "ok", "refused": [], "open_tiles": 0}
+    assert client.get("/readyz").json() == {"status": "ok", "refused": [], "open_tiles": 0, "cached_tiles": 0}
 
 
 @pytest.fixture

@@ -15,11 +15,12 @@ from service.errors import SearchError
 from service.geometry.rigid import transform_from
 from service.maps import tiles as tiles_module
 from service.maps.content import BundleContent
+from service.maps.store.transfer import push
 from service.maps.tiled_writer import write_tiled
 from service.maps.tiles import TiledMap
 from service.maps.writer import write_bundle
 from service.runtime.engine import Engine
-from service.runtime.settings import Settings
+from service.runtime.settings import MapUrl, Settings
 from tests.unit.lattice import as_tile
 
 TILE_M = 50.0
@@ -127,6 +128,21 @@ def test_the_service_describes_the_whole_map(client: httpx.Client, tiled: httpx.
     assert streets[0] == streets[1]
     features = [each.get("/v1/coverage").json()["features"] for each in (client, tiled)]
     assert features[0][0]["geometry"] == features[1][0]["geometry"]
+
+
+def test_readiness_tells_the_tiles_in_the_cache(
+    tiled_path: Path, client_of: Callable[[Engine], httpx.Client], tmp_path: Path
+) -> None:
+    push(tiled_path, url := f"file://{tmp_path}/store/tiny")
+    engine = Engine.open(Settings(maps=(MapUrl(url),), tile_cache=tmp_path / "cache", threads=1))
+    try:
+        (opened,) = (each.bundle for each in engine.registry)
+        assert isinstance(opened, TiledMap)
+        del opened.tiles._opened[0]
+        told = client_of(engine).get("/readyz").json()
+    finally:
+        engine.close()
+    assert (told["open_tiles"], told["cached_tiles"]) == (3, 4)
 
 
 def test_the_console_draws_all_tiles(

@@ -27,6 +27,7 @@ from model_training.mapping import engines, site_check, tile_area
 from model_training.mapping.build import build_map, describe
 from model_training.mapping.build_tile import build_tile, key_of_tile
 from model_training.mapping.build_tiled import build_tiled
+from model_training.mapping.seams import read_positions
 from model_training.mapping.settings import BuildSettings
 from model_training.mapping.tile_area import Square, TileArea
 from model_training.mapping.work import work_folder
@@ -108,6 +109,36 @@ def tasks_of(small_dataset, encoder_file, tmp_path, monkeypatch):
         return found
 
     return planned
+
+
+def test_a_build_says_how_far_its_tiles_disagree_and_warns_if_that_is_much(
+    small_dataset, encoder_file, serial, tmp_path, monkeypatch
+):
+    """The poses of the survey are exact, so the tiles agree. Then the alignment of one tile puts its scans 7 cm aside."""
+    told, warned = [], []
+    build_tiled(
+        small_dataset, encoder_file, tmp_path / "a", SETTINGS, tile_m=TILE_M, tell=told.append, warn=warned.append
+    )
+    assert len(told) == 1
+    assert "scans are in several tiles" in told[0]
+    assert warned == []
+    aside_m = iter([0.0, 0.07])
+
+    def moved(file):
+        positions_m = read_positions(file)
+        assert positions_m is not None
+        return positions_m + [0.0, 0.0, next(aside_m)]
+
+    monkeypatch.setattr(driver, "read_positions", moved)
+    build_tiled(
+        small_dataset, encoder_file, tmp_path / "b", SETTINGS, tile_m=TILE_M, tell=told.append, warn=warned.append
+    )
+    assert len(told) == 2
+    assert len(warned) == 1
+    assert "the tiles disagree by up to 7 cm" in warned[0]
+    unaligned = replace(SETTINGS, align_survey=False)
+    build_tiled(small_dataset, encoder_file, tmp_path / "c", unaligned, tile_m=TILE_M, tell=told.append)
+    assert len(told) == 2
 
 
 def test_a_tiled_map_has_every_place_of_an_untiled_one_in_its_square(small_dataset, encoder_file, serial, tmp_path):

@@ -143,7 +143,23 @@ def test_differences_of_tiled_maps(halves: tuple[Path, Path], squares: dict[tupl
     assert f"tiles:       {len(numbers) - 2} added, 1 removed, 0 changed, 1 kept" in out
     code, out = run("diff", *halves, "--json")
     assert json.loads(out)["kept"] == 1
-    assert run("diff", *halves, "--picture", "x.png")[0] == 2
+
+
+def test_a_picture_of_two_tiled_maps_is_refused_and_the_proposed_command_draws_that_of_a_tile(
+    halves: tuple[Path, Path], tmp_path: Path
+) -> None:
+    code, told = run("diff", *halves, "--picture", "x.png")
+    assert code == 2
+    before, after = halves
+    text = " ".join(told.replace("│", " ").split())
+    assert f"streetfix map diff {before}/tiles/VERSION {after}/tiles/VERSION --picture FILE" in text
+    assert "streetfix map info --json" in text
+    listed = [json.loads(run("info", each, "--json")[1])["tiles"] for each in halves]
+    versions = [{(tile["column"], tile["row"]): tile["version"] for tile in tiles} for tiles in listed]
+    square = next(iter(versions[0].keys() & versions[1].keys()))
+    folders = [half / "tiles" / of[square] for half, of in zip(halves, versions, strict=True)]
+    assert run("diff", *folders, "--picture", tmp_path / "tile.png")[0] == 0
+    assert (tmp_path / "tile.png").read_bytes().startswith(b"\x89PNG")
 
 
 def test_info_of_a_tiled_map(halves: tuple[Path, Path]) -> None:

@@ -3,6 +3,7 @@
 import errno
 import hashlib
 import json
+import os
 import shutil
 import subprocess
 import sys
@@ -30,10 +31,10 @@ from service.maps.store import cache as cache_module
 from service.maps.store import fetch, remote, transfer
 from service.maps.store.cache import TileCache
 from service.maps.store.remote import Remote, checked_url, split_version
-from service.maps.store.stored_map import StoredMap, StoreTiles
+from service.maps.store.stored_map import UNUSED_S, StoredMap, StoreTiles
 from service.maps.store.transfer import pull, push
 from service.maps.tiled_writer import write_tiled
-from service.maps.tiles import TiledMap, TileSource
+from service.maps.tiles import MOST_SEARCHED, TiledMap, TileSource
 from service.maps.writer import write_bundle
 from tests.unit.lattice import as_tile
 
@@ -105,6 +106,19 @@ def same_files(one: Path, other: Path) -> bool:
 
 def versions_in(tiles: Path) -> set[str]:
     return {each.name.partition("-")[0] for each in tiles.iterdir()}
+
+
+class Row:
+    """A search that lists the first views, in place of a server."""
+
+    def __init__(self, of_map: Manifest) -> None:
+        self.views = of_map.counts.views
+
+    def most_similar(self, _: Any, k: int) -> Any:
+        return np.arange(min(k, self.views))
+
+    def shortlist(self, *_: Any) -> Any:
+        raise AssertionError("no query asks for it")
 
 
 def left_over(folder: Path) -> list[Path]:
@@ -402,6 +416,53 @@ class TestBound:
         tiles.folder(manifest.tiles[1])
         assert versions_in(folder) == {manifest.tiles[tile].version for tile in (1, 2)}
 
+    def test_tiles_are_counted_only_if_their_size_is_unknown_or_there_is_no_room(
+        self, town: Path, file_url: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        tiles, manifest, folder = self.bounded(town, file_url, tmp_path, 2.5)
+        counted: list[str] = []
+        count = cache_module._Kept.of
+        monkeypatch.setattr(cache_module._Kept, "of", lambda path: counted.append(path.name) or count(path))
+        lock = tmp_path / "cache" / ".lock"
+
+        def counts(tile: int) -> int:
+            """Return how many folders the fetch of a tile counts: those that are there, and that of the new tile."""
+            counted.clear()
+            tiles.folder(manifest.tiles[tile])
+            found = len(counted)
+            assert int(lock.read_text()) == sum(count(each).size for each in folder.iterdir())
+            return found
+
+        assert counts(0) == 1
+        assert counts(1) == 0
+        assert counts(2) == 3  # no room
+        assert len(list(folder.iterdir())) == 2
+        shutil.rmtree(tiles.folder(manifest.tiles[2]))
+        tiles._cache.delete(tmp_path / "cache" / "another-version")
+        assert lock.read_text() == ""
+        assert counts(2) == 2
+        lock.write_text("")  # an earlier release empties the file
+        tiles._cache.delete(tiles.folder(manifest.tiles[1]))
+        assert counts(1) == 2
+
+    def test_a_full_cache_is_freed_a_little_beyond_what_a_tile_needs(
+        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        """A bound of 1,000 bytes, tiles of 10 bytes: every third fetch into the full cache counts, and frees 10 + 20 bytes."""
+        cache = TileCache(tmp_path, 1000)
+        counted, count = [], cache_module._Kept.of
+        monkeypatch.setattr(cache_module._Kept, "of", lambda path: counted.append(path) or count(path))
+        walks = []
+        for number in range(109):
+            counted.clear()
+            cache.once(tmp_path / "town" / "tiles" / str(number), lambda into: cache.reserve(into, {"places.npy": 10}))
+            os.utime(tmp_path / "town" / "tiles" / str(number), (number, number))
+            if counted:
+                walks.append(number)
+        assert walks == [0, 100, 103, 106]
+        left = {int(each.name) for each in (tmp_path / "town" / "tiles").iterdir()}
+        assert left == set(range(9, 109))
+
     def test_a_deleted_tile_stays_readable_where_it_is_open(self, town: Path, file_url: str, tmp_path: Path) -> None:
         tiles, manifest, folder = self.bounded(town, file_url, tmp_path, 1.5)
         opened = MapBundle.open(tiles.folder(manifest.tiles[0]))
@@ -653,6 +714,70 @@ class TestVersions:
         found.refresh()
         assert read_manifest(version).made_at == later.made_at
 
+    def test_files_that_another_version_has_are_links_unless_they_are_damaged(
+        self, town: Path, url: str, cache: TileCache, content_of: Content, encoder_of: Any, tmp_path: Path
+    ) -> None:
+        push(town, url)
+        fetched: list[int] = []
+
+        @contextmanager
+        def follow(_: str, __: str, size: int) -> Iterator[Any]:
+            fetched.append(size)
+            yield lambda _: None
+
+        found = StoredMap(url, cache, follow)
+        found.refresh()
+        old = found.folder / read_manifest(town).version
+        new = write_tiled_map(tmp_path / "larger", content_of, encoder_of(), tiles=4)
+        push(tmp_path / "larger", url)
+        found.refresh()
+        own = found.folder / new.version
+        same = {name for name, entry in new.files.items() if entry == read_manifest(town).files.get(name)}
+        assert "encoder.onnx" in same
+        assert "places.npy" not in same
+        assert {name for name in new.files if (own / name).samefile(old / name)} == same
+        assert fetched[1] == sum(entry.size for name, entry in new.files.items() if name not in same)
+        TiledMap.open(own, source=found.tiles(own))
+        cache.delete(own)
+        encoder = old / "encoder.onnx"
+        encoder.write_bytes(b"?" + encoder.read_bytes()[1:])
+        again = StoredMap(url, cache)
+        again.refresh()
+        assert not (own / "encoder.onnx").samefile(encoder)
+        TiledMap.open(own, source=again.tiles(own))
+
+    def test_a_search_index_that_a_server_replaces_is_left_out_until_it_is_needed(
+        self, file_url: str, cache: TileCache, content_of: Content, encoder_of: Any, tmp_path: Path
+    ) -> None:
+        made = write_tiled_map(tmp_path / "large", content_of, encoder_of(), tiles=MOST_SEARCHED + 1)
+        push(tmp_path / "large", file_url)
+        for url in (file_url, f"{file_url}@{made.version}"):
+            found = StoredMap(url, cache, is_searched_elsewhere=True)
+            found.refresh()
+            version = found.folder / made.version
+            assert {name for name in made.files if not (version / name).exists()} == {"search.faiss"}
+            opened = TiledMap.open(version, source=found.tiles(version), open_search=Row)
+            assert isinstance(opened.search, Row)
+            with pytest.raises(BundleError, match=r"search\.faiss: missing"):
+                TiledMap.open(version, source=found.tiles(version))
+        for url in (file_url, f"{file_url}@{made.version}"):  # the setting is gone
+            found = StoredMap(url, cache)
+            found.refresh()
+            assert TiledMap.open(version, source=found.tiles(version)).search is not None
+            assert left_over(found.folder) == []
+            assert not list(found.folder.glob(".*"))
+            (version / "search.faiss").unlink()
+
+    def test_the_search_index_of_a_map_of_few_tiles_is_fetched_with_a_server_too(
+        self, town: Path, file_url: str, cache: TileCache
+    ) -> None:
+        push(town, file_url)
+        found = StoredMap(file_url, cache, is_searched_elsewhere=True)
+        found.refresh()
+        assert {each for each in read_manifest(town).files if (found.versions()[0] / each).exists()} == set(
+            read_manifest(town).files
+        ) - NOT_SERVED
+
     def test_a_pinned_version_is_served_although_the_store_has_a_newer_one(
         self, town: Path, url: str, cache: TileCache, content_of: Content, encoder_of: Any, tmp_path: Path
     ) -> None:
@@ -673,6 +798,31 @@ class TestVersions:
         pinned.forget(())  # the other service needs the new version
         assert {each.name for each in follows.versions()} == {old.version, new.version}
         assert pinned.versions() == [version]
+
+    def test_a_service_with_a_pin_deletes_versions_that_no_process_has_used_for_days(
+        self, town: Path, file_url: str, cache: TileCache, content_of: Content, encoder_of: Any, tmp_path: Path
+    ) -> None:
+        versions = [read_manifest(town).version]
+        push(town, file_url)
+        for tiles in (4, 5):
+            out = tmp_path / str(tiles)
+            versions.append(write_tiled_map(out, content_of, encoder_of(), tiles=tiles).version)
+            push(out, file_url)
+        unused, other, own = [StoredMap(f"{file_url}@{version}", cache) for version in versions]
+        for each in (unused, other, own):
+            each.refresh()
+        long_ago = time.time() - UNUSED_S - 60
+        for version in versions:
+            os.utime(own.folder / version, (long_ago, long_ago))
+        other.refresh()  # another process, which starts and marks its version
+        own.forget([versions[2]])
+        assert {each.parent.name for each in own.folder.glob("*/manifest.json")} == set(versions[1:])
+        os.utime(own.folder / versions[1], (long_ago, long_ago))
+        other.forget([versions[1]])  # a scan marks it again, and finds that of `own` just marked
+        own.forget([versions[2]])
+        assert {each.parent.name for each in own.folder.glob("*/manifest.json")} == set(versions[1:])
+        unused.refresh()  # it comes back when a service needs it
+        assert len(unused.versions()) == 1
 
     def test_a_pinned_version_in_the_cache_needs_no_store(self, town: Path, file_url: str, cache: TileCache) -> None:
         push(town, file_url)

@@ -143,6 +143,17 @@ def test_the_memory_left_to_an_image_is_freed_with_it() -> None:
     assert budget.held == 0
 
 
+def test_a_part_of_the_memory_can_be_left_to_an_object() -> None:
+    budget, picture = MemoryBudget(10), np.zeros(3)
+    with budget.hold() as hold:
+        hold.grow(6)
+        hold.leave_with(picture, 4)
+        assert (hold.bytes, budget.held) == (2, 6)
+    assert budget.held == 4
+    del picture
+    assert budget.held == 0
+
+
 def test_watchers_receive_every_change() -> None:
     budget, told = MemoryBudget(10), list[float]()
     budget.watch(told.append)

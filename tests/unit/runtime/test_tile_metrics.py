@@ -111,3 +111,54 @@ def test_the_metrics_of_workers_are_added_up(tmp_path: Path) -> None:
     assert found[REQUESTS, "miss", "query"] == found[REQUESTS, "hit", "prefetch"] == 2
     assert found["streetfix_fetch_bytes_total", "tile"] == 200
     assert (found["streetfix_fetch_seconds_count", "tile"], found["streetfix_fetch_seconds_sum", "tile"]) == (2, 1)
+
+
+OPENS = """
+import sys
+from pathlib import Path
+from service.runtime.engine import Engine
+from service.runtime.settings import Settings
+engine = Engine.open(Settings(maps=(Path(sys.argv[1]),), threads=1))
+"""
+
+
+def test_the_open_tiles_of_workers_are_added_up(town: str, tmp_path: Path) -> None:
+    """The warm-up of each worker opens the three tiles."""
+    shared = tmp_path / "counts"
+    shared.mkdir()
+    environment = {**os.environ, "PROMETHEUS_MULTIPROC_DIR": str(shared)}
+    told = [
+        subprocess.run(
+            [sys.executable, "-c", program, str(tmp_path / "town")],
+            env=environment,
+            capture_output=True,
+            text=True,
+            check=True,
+        )
+        for program in (OPENS, OPENS, SCRAPES)
+    ]
+    assert values(told[-1].stdout)["streetfix_open_tiles", "town"] == 6
+
+
+def test_open_tiles_are_counted_when_they_open_and_close_and_are_zero_without_their_map(
+    town: str, tmp_path: Path
+) -> None:
+    del town
+    engine = Engine.open(Settings(maps=(tmp_path / "town",), threads=1))
+
+    def counted() -> float:
+        return values(engine.metrics.text().decode())["streetfix_open_tiles", "town"]
+
+    try:
+        (opened,) = (each.bundle for each in engine.registry)
+        assert isinstance(opened, TiledMap)
+        assert opened.open_tiles == counted() == 3
+        del opened.tiles._opened[2]
+        opened.tiles._limit = 1
+        opened.tiles.get(2)
+        assert opened.open_tiles == counted() == 1
+        engine.registry.unmount("town", opened.manifest.version)
+        assert len(engine.registry) == 0
+        assert counted() == 0
+    finally:
+        engine.close()
