@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from service.registration.surfel_tiles import Surfels
 from service.scoring.measured import MeasuredFrame
-from service.scoring.photometry import PhotometrySettings, grey_of, mapped_brightness
+from service.scoring.photometry import PhotometrySettings, grey_of, mapped_brightness, seen_by_lens
 from service.scoring.ray_image import RayImage, inverse_of
 
 #: Planes of a comparison, in their order.
@@ -64,7 +64,7 @@ class FrameCells:
     Attributes:
         pixel: index of the pixel in the flat small image; 0 where there is none.
         in_view: whether a pixel shows the direction.
-        brightness: logarithm of the grey level minus the mean of the image.
+        brightness: logarithm of the grey level minus its mean over the pixels that the lens saw; 0 where it saw nothing.
     """
 
     pixel: Int64[NDArray[np.int64], "64 128"]
@@ -89,8 +89,22 @@ class FrameCells:
         v = np.rint(rays[..., 1] / z * camera.fy + camera.cy).astype(np.int64)
         in_view = ahead & (u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height)
         pixel = np.where(in_view, v * camera.width + u, 0)
-        grey = grey_of(measured.frame.query.rgb, camera, measured.blocks.covered, settings)
-        return cls(pixel, in_view, np.where(in_view, (grey - grey.mean()).ravel()[pixel], np.float32(0)))
+        brightness = _brightness_of(measured, settings).ravel()[pixel]
+        return cls(pixel, in_view, np.where(in_view, brightness, np.float32(0)))
+
+
+def _brightness_of(measured: MeasuredFrame, settings: PhotometrySettings) -> Float32[NDArray[np.float32], "H W"]:
+    """Return the logarithm of the grey level of each pixel of the small image minus its mean.
+
+    Pixels that the lens did not see are black after the rectification. They do not count in the mean, and their brightness is 0.
+    """
+    query, camera, covered = measured.frame.query, measured.picture.camera, measured.blocks.covered
+    grey = grey_of(query.rgb, camera, covered, settings)
+    if query.observed is None:
+        return np.asarray(grey - grey.mean())
+    seen = seen_by_lens(query.observed, camera, covered)
+    mean = grey[seen].mean() if seen.any() else np.float32(0)
+    return np.where(seen, grey - mean, np.float32(0))
 
 
 def comparison_of(

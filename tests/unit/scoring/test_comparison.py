@@ -30,10 +30,10 @@ def measured_with(frame_with, matches_at):
     """Return a function that measures a frame with given rotation, images and camera."""
     frame = frame_with(matches_at([(0, 0, 2)], [0], [0.9]))
 
-    def measured(*, R=LEVEL, depth_m=None, rgb=None, camera=CAMERA):
+    def measured(*, R=LEVEL, depth_m=None, rgb=None, camera=CAMERA, observed=None):
         depth_m = np.full((camera.height, camera.width), 8.0, np.float32) if depth_m is None else depth_m
         rgb = np.full((*depth_m.shape, 3), 90, np.uint8) if rgb is None else rgb
-        query = replace(frame.query, depth_m=depth_m, rgb=rgb, camera=camera)
+        query = replace(frame.query, depth_m=depth_m, rgb=rgb, camera=camera, observed=observed)
         (found,) = measure(
             (replace(frame, query=query, views=replace(frame.views, R_level_camera=R)),),
             PointSettings(),
@@ -169,6 +169,33 @@ def test_brightness_is_relative_to_the_image(measured_with, surfels):
     middle = found[ROWS // 2]
     assert middle[COLUMNS // 2 - 10] < -0.1 < 0.1 < middle[COLUMNS // 2 + 10]
     np.testing.assert_allclose(found, same, atol=0.06)
+
+
+def test_pixels_that_the_lens_did_not_see_are_no_dark_surfaces(measured_with, surfels):
+    """The left third of the image is black and unobserved, the middle third has a grey level of 40, and the right third one of 160.
+
+    The logarithms of the seen pixels are log 48 and log 168. Their mean is half of the sum.
+    """
+    rgb, observed = np.zeros((90, 120, 3), np.uint8), np.ones((90, 120), np.bool_)
+    rgb[:, 40:80], rgb[:, 80:], observed[:, :40] = 40, 160, False
+    one = measured_with(rgb=rgb, observed=observed)
+    found, column = planes(one, surfels, image_of(one, 8, 8)), FrameCells.of(one, PHOTOMETRY).pixel % 120
+    inside = found["in_view"] > 0
+    assert {True, False} == set((column[inside] < 40).tolist())
+    half = 0.5 * np.log(168 / 48) / 3
+    np.testing.assert_array_equal(found["brightness"][inside & (column < 40)], 0)
+    np.testing.assert_allclose(found["brightness"][inside & (column >= 40) & (column < 80)], -half, rtol=1e-5)
+    np.testing.assert_allclose(found["brightness"][inside & (column >= 80)], half, rtol=1e-5)
+    blind = measured_with(rgb=rgb, observed=np.zeros_like(observed))
+    assert (planes(blind, surfels, image_of(blind, 8, 8))["brightness"] == 0).all()
+
+
+def test_an_image_that_the_lens_saw_whole_is_compared_as_one_of_a_pinhole_camera(measured_with):
+    rgb = np.random.default_rng(0).integers(0, 256, (90, 120, 3), np.uint8)
+    plain, rectified = measured_with(rgb=rgb), measured_with(rgb=rgb, observed=np.ones((90, 120), np.bool_))
+    one, same = (FrameCells.of(each, PHOTOMETRY).brightness for each in (plain, rectified))
+    np.testing.assert_allclose(one, same, atol=1e-6)
+    assert one.std() > 0.3
 
 
 def test_without_surfels_the_brightness_of_the_map_is_not_shown(measured_with, surfels):
