@@ -118,20 +118,24 @@ def comparison_of(
         surfels: surfels of the map, whose brightness is shown; None if brightness is not compared.
         settings: settings of the brightness.
     """
-    inverse, mapped_inverse = inverse_of(image.z_m), inverse_of(image.mapped_m)
-    known, hit = image.z_m > 0, image.mapped_m > 0
+    # Only the pixels of the cells are computed: a tall image has a hundred times as many. The mean of the map's brightness needs all.
+    z_m, mapped_m, sigma, climb = (
+        each.ravel()[cells.pixel] for each in (image.z_m, image.mapped_m, image.sigma, image.climb)
+    )
+    inverse, mapped_inverse = inverse_of(z_m), inverse_of(mapped_m)
+    known, hit = z_m > 0, mapped_m > 0
     both = known & hit
-    sigmas = np.where(both, (inverse - mapped_inverse) / image.sigma, 0.0)
-    ratio = np.where(both, inverse * image.mapped_m - 1.0, 0.0)
+    sigmas = np.where(both, (inverse - mapped_inverse) / sigma, 0.0)
+    ratio = np.where(both, inverse * mapped_m - 1.0, 0.0)
     heights = (
-        np.where(seen, np.clip((z * image.climb + image.camera_m) / _HEIGHT_M, _BELOW, 1.0), 0.0)
-        for z, seen in ((image.z_m, known), (image.mapped_m, hit))
+        np.where(seen, np.clip((z * climb + image.camera_m) / _HEIGHT_M, _BELOW, 1.0), 0.0)
+        for z, seen in ((z_m, known), (mapped_m, hit))
     )
     if surfels is not None and surfels.has_brightness:
-        shown = np.nan_to_num(mapped_brightness(surfels, image.surfel_of, settings))
+        shown = np.nan_to_num(mapped_brightness(surfels, image.surfel_of, settings).ravel()[cells.pixel])
     else:
-        shown = np.zeros(image.z_m.shape, np.float32)
-    planes = np.stack(
+        shown = np.zeros(cells.pixel.shape, np.float32)
+    planes: Comparison = np.stack(
         [
             known,
             hit,
@@ -140,12 +144,10 @@ def comparison_of(
             np.tanh(sigmas / _SIGMAS),
             np.tanh(ratio / _RATIO),
             *heights,
-            np.minimum(image.sigma * image.mapped_m, 1.0),
-            np.zeros(image.z_m.shape),
+            np.minimum(sigma * mapped_m, 1.0),
+            np.clip(cells.brightness / _LOG_BRIGHTNESS, -1.0, 1.0),
             np.clip(shown / _LOG_BRIGHTNESS, -1.0, 1.0),
-            np.ones(image.z_m.shape),
+            cells.in_view,
         ]
     ).astype(np.float32)
-    found = planes.reshape(len(PLANES), -1)[:, cells.pixel] * cells.in_view
-    found[PLANES.index("brightness")] = np.clip(cells.brightness / _LOG_BRIGHTNESS, -1.0, 1.0)
-    return found.astype(np.float32)
+    return planes * cells.in_view

@@ -2,10 +2,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from service.geometry.camera import PinholeCamera
 from service.registration.points import PointSettings
 from service.registration.rays import RaySettings
+from service.registration.surfel_map import SurfelMap
 from service.registration.visibility import SurfelRaycaster
 from service.scoring.comparison import (
     AZIMUTH_RAD,
@@ -64,6 +67,11 @@ def planes(one, street, image):
     assert found.dtype == np.float32
     assert np.abs(found).max() <= 1
     return dict(zip(PLANES, found, strict=True))
+
+
+def with_brightness(street_map, intensities):
+    """Return the same surfels with these intensities."""
+    return SurfelMap.prepare(street_map.origin_m, street_map.unpacked(np.s_[:]), np.asarray(intensities, np.float32))
 
 
 @pytest.fixture
@@ -196,6 +204,33 @@ def test_an_image_that_the_lens_saw_whole_is_compared_as_one_of_a_pinhole_camera
     one, same = (FrameCells.of(each, PHOTOMETRY).brightness for each in (plain, rectified))
     np.testing.assert_allclose(one, same, atol=1e-6)
     assert one.std() > 0.3
+
+
+@settings(max_examples=20)
+@given(seed=st.integers(0, 2**32 - 1))
+def test_each_cell_shows_what_the_whole_image_has_at_its_pixel(street_map, seed):
+    """An image of 64 x 128 pixels whose cells are its own pixels shows all of them. Any other cells show some of these, to the bit."""
+    rng, shape, count = np.random.default_rng(seed), (ROWS, COLUMNS), len(street_map.surfels)
+    intensities = np.where(rng.random(count) < 0.1, np.nan, rng.gamma(2.0, 20.0, count)).astype(np.float32)
+    surfels = with_brightness(street_map, intensities)
+    z_m, mapped_m = (np.where(rng.random(shape) < 0.3, 0.0, rng.uniform(0.5, 60.0, shape)) for _ in range(2))
+    image = RayImage(
+        surfel_of=np.where(rng.random(shape) < 0.3, -1, rng.integers(0, count, shape)).astype(np.int32),
+        z_m=z_m,
+        mapped_m=mapped_m,
+        sigma=rng.uniform(1e-4, 0.1, shape),
+        climb=rng.normal(0.0, 0.5, shape),
+        camera_m=1.5,
+    )
+    brightness = rng.normal(0.0, 2.0, shape).astype(np.float32)
+    own = FrameCells(np.arange(ROWS * COLUMNS).reshape(shape), np.ones(shape, np.bool_), brightness)
+    whole = comparison_of(own, image, surfels, PHOTOMETRY).reshape(len(PLANES), -1)
+    in_view = rng.random(shape) < 0.8
+    pixel = np.where(in_view, rng.integers(0, ROWS * COLUMNS, shape), 0)
+    shown = np.where(in_view, brightness.ravel()[pixel], np.float32(0))
+    found = comparison_of(FrameCells(pixel, in_view, shown), image, surfels, PHOTOMETRY)
+    np.testing.assert_array_equal(found, whole[:, pixel] * in_view)
+    assert (found[PLANES.index("mapped_brightness")] != 0).mean() > 0.3
 
 
 def test_without_surfels_the_brightness_of_the_map_is_not_shown(measured_with, surfels):
