@@ -25,13 +25,21 @@ def test_the_shipped_verifier_prefers_a_map_that_agrees():
     assert right > wrong + 1
 
 
-def test_comparisons_are_independent_of_each_other_and_of_the_batch():
+def test_comparisons_are_independent_of_each_other():
     one, other = comparison(agrees=True), comparison(agrees=False)
     verifier = Verifier.shipped()
-    together = verifier.log_odds([one, other] * 20)
-    assert together.shape == (40,)
-    np.testing.assert_allclose(together[::2], verifier.log_odds([one])[0], atol=1e-4)
-    np.testing.assert_allclose(together[1::2], verifier.log_odds([other])[0], atol=1e-4)
+    together = verifier.log_odds([one, other] * 3)
+    assert together.dtype == np.float32
+    assert together.shape == (6,)
+    np.testing.assert_array_equal(together[::2], verifier.log_odds([one])[0])
+    np.testing.assert_array_equal(together[1::2], verifier.log_odds([other])[0])
+    assert together[0] != together[1]
+
+
+def test_no_comparisons_have_no_log_odds():
+    found = Verifier.shipped().log_odds([])
+    assert found.dtype == np.float32
+    assert found.shape == (0,)
 
 
 def test_an_empty_comparison_has_finite_log_odds():
