@@ -6,7 +6,6 @@ surveys, that no calibration and no evaluation uses (``streetfix train-verifier`
 calibrates it, and a part of the support of a pose.
 """
 
-import hashlib
 from collections.abc import Sequence
 from functools import cache
 from pathlib import Path
@@ -28,22 +27,22 @@ class Verifier:
 
     Args:
         session: session of ONNX Runtime with the network.
-        sha256: hash of the ONNX file.
-
-    Attributes:
-        sha256: hash of the ONNX file.
 
     Raises:
-        EncoderError: the network does not read comparisons of this program.
+        EncoderError: the network does not read single comparisons of this program, or does not return one number for each.
     """
 
-    def __init__(self, session: Session, sha256: str) -> None:
-        self._session, self.sha256 = session, sha256
-        shapes = {each.name: list(each.shape)[1:] for each in session.get_inputs()}
-        if shapes != {"comparison": [len(PLANES), ROWS, COLUMNS]}:
+    def __init__(self, session: Session) -> None:
+        self._session = session
+        inputs = {each.name: list(each.shape) for each in session.get_inputs()}
+        outputs = {each.name: list(each.shape) for each in session.get_outputs()}
+        batch, *planes = inputs.get("comparison", [None])
+        fixed = isinstance(batch, int) and batch != 1  # a batch of any size has a name instead of a number
+        one_number = len(outputs.get("log_odds", [])) == 1
+        if len(inputs) != 1 or planes != [len(PLANES), ROWS, COLUMNS] or fixed or not one_number:
             raise EncoderError(
-                f"the verifier reads {shapes}, but comparisons have {len(PLANES)} planes of {ROWS} x {COLUMNS}; train it with "
-                "`streetfix train-verifier`",
+                f"the verifier reads {inputs} and returns {outputs}, but comparison -> log_odds are expected, {len(PLANES)} planes of "
+                f"{ROWS} x {COLUMNS} in a batch of 1 or of any size; train it with `streetfix train-verifier`",
                 field="verifier",
             )
 
@@ -68,7 +67,7 @@ class Verifier:
                 f"{source}: ONNX Runtime cannot load the verifier ({error}); train it with `streetfix train-verifier`",
                 field="verifier",
             ) from error
-        return Verifier(session, hashlib.sha256(data).hexdigest())
+        return Verifier(session)
 
     @staticmethod
     @cache

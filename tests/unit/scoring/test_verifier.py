@@ -1,4 +1,5 @@
 import numpy as np
+import onnx
 import pytest
 
 from model_training.stock import ENCODER
@@ -48,7 +49,7 @@ def test_an_empty_comparison_has_finite_log_odds():
 
 def test_the_shipped_verifier_is_opened_once():
     assert Verifier.shipped() is Verifier.shipped()
-    assert len(Verifier.open(SHIPPED).sha256) == 64
+    assert Verifier.open(SHIPPED) is not Verifier.shipped()
 
 
 def test_a_missing_file_is_named(tmp_path):
@@ -64,5 +65,42 @@ def test_a_damaged_file_is_named(tmp_path):
 
 
 def test_a_network_with_other_inputs_is_refused():
-    with pytest.raises(EncoderError, match="12 planes of 64 x 128"):
+    with pytest.raises(
+        EncoderError, match=r"comparison -> log_odds are expected.*12 planes of 64 x 128.*train-verifier"
+    ):
         Verifier.open(ENCODER)
+
+
+@pytest.fixture
+def network_at(tmp_path):
+    """Return a function that writes a network which averages a comparison."""
+
+    def written(*, batch="batch", planes=12, output="log_odds", keeps_axes=False):
+        helper, floats = onnx.helper, onnx.TensorProto.FLOAT
+        averaged = [batch, 1, 1, 1] if keeps_axes else [batch]
+        graph = helper.make_graph(
+            [helper.make_node("ReduceMean", ["comparison"], [output], axes=[1, 2, 3], keepdims=int(keeps_axes))],
+            "average",
+            [helper.make_tensor_value_info("comparison", floats, [batch, planes, ROWS, COLUMNS])],
+            [helper.make_tensor_value_info(output, floats, averaged)],
+        )
+        path = tmp_path / "average.onnx"
+        path.write_bytes(
+            helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=8).SerializeToString()
+        )
+        return path
+
+    return written
+
+
+@pytest.mark.parametrize("batch", ["batch", 1])
+def test_a_network_gives_the_log_odds_of_its_comparisons_in_their_order(network_at, batch):
+    planes = [np.full((len(PLANES), ROWS, COLUMNS), value, np.float32) for value in (0.25, -0.5)]
+    assert Verifier.open(network_at(batch=batch)).log_odds(planes) == pytest.approx([0.25, -0.5])
+
+
+@pytest.mark.parametrize("changed", [{"batch": 2}, {"planes": 11}, {"output": "odds"}, {"keeps_axes": True}])
+def test_a_network_with_other_planes_outputs_or_batches_is_refused(network_at, changed):
+    with pytest.raises(EncoderError, match="comparison -> log_odds are expected") as refused:
+        Verifier.open(network_at(**changed))
+    assert refused.value.field == "verifier"
