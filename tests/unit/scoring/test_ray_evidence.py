@@ -13,8 +13,8 @@ from service.registration.visibility import Raycasters, SurfelRaycaster
 from service.scoring import ray_evidence as along_rays
 from service.scoring.measured import measure
 from service.scoring.photometry import PhotometrySettings
-from service.scoring.ray_evidence import RayScorer, RayWeights, ray_evidence, ray_evidence_of
-from service.scoring.ray_image import RayImage, ray_images_of
+from service.scoring.ray_evidence import RayScorer, RayWeights, mean_evidence, ray_evidence_of
+from service.scoring.ray_image import RayImage, ray_image_of
 from service.scoring.verifier import Verifier
 
 #: 60 columns and 40 rows, 1.5 m above the ground. A ray of row r gains (19.5 - r) / 20 m for each metre of depth.
@@ -135,14 +135,12 @@ def test_the_numbers_are_shares(seed, sigma):
 
 
 def evidence_at(raycaster, measured, pose):
-    return ray_evidence(ray_images_of(raycaster, measured, pose))
+    return mean_evidence([ray_evidence_of(ray_image_of(raycaster, each, each.pose(pose))) for each in measured])
 
 
-def scorer_of(street_map, measured, settings=None):
-    settings = settings or RaySettings()
-    return RayScorer(
-        Raycasters(street_map, settings), measured, settings, RayWeights(), PhotometrySettings(), Verifier.shipped()
-    )
+def scorer_of(cloud, measured, settings=None, verifier=None):
+    settings, verifier = settings or RaySettings(), verifier or Verifier.shipped()
+    return RayScorer(Raycasters(cloud, settings), measured, settings, RayWeights(), PhotometrySettings(), verifier)
 
 
 @pytest.fixture
@@ -271,3 +269,23 @@ def test_a_pose_with_too_few_rays_is_compared_as_it_is(street_map, measured, can
     assert found.pose is pose
     assert found.scatter is None
     assert found.evidence == evidence_at(SurfelRaycaster(street_map, settings), measured, pose)
+
+
+class Listening(Verifier):
+    """A verifier that keeps what it is asked, and gives the next of some log odds for each comparison."""
+
+    def __init__(self, *odds):
+        self.asked, self._odds = [], list(odds)
+
+    def log_odds(self, comparisons):
+        self.asked += comparisons
+        return np.array([self._odds.pop(0) for _ in comparisons], np.float32)
+
+
+def test_the_comparisons_of_a_pose_are_those_that_the_verifier_saw(street_map, measured, candidate):
+    verifier = Listening(1.5)
+    scorer = scorer_of(street_map, measured, verifier=verifier)
+    found = scorer.at(candidate(xyz=(0.3, 0.0, 1.5)).registered)
+    np.testing.assert_array_equal(scorer.comparisons(found.pose), verifier.asked)
+    other = scorer.comparisons(candidate(xyz=(0.3, 0.0, 1.5)).registered)
+    assert np.abs(other[0] - verifier.asked[0]).max() > 0.1
