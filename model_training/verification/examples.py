@@ -1,8 +1,9 @@
 """Examples for the verifier: comparisons of poses with maps, each with the distance to the true position.
 
-The localizer itself chooses the poses, so the wrong ones are those that look right to registration and to all scores. Images of the city
-before are asked in the map of a city: there every answer is wrong. Further poses start up to 8 m beside an answer and are adjusted to the
-map. They end in other minima near the right one.
+The localizer itself chooses the poses, so the wrong ones are those that look right to registration and to all other scores. No verifier
+takes part in the choice (``EvenOdds``), so a training does not depend on an earlier one. Images of the city before are asked in the map of
+a city: there every answer is wrong. Further poses start up to 8 m beside an answer and are adjusted to the map. They end in other minima
+near the right one.
 """
 
 import shutil
@@ -20,6 +21,7 @@ from model_training.evaluation.odometry import as_query
 from model_training.mapping.build import build_map
 from model_training.mapping.settings import BuildSettings
 from model_training.simulation.simulate import simulate
+from model_training.verification.even_odds import EvenOdds
 from model_training.verification.plans import verification_plan
 from service.errors import DatasetError, NoDepthError
 from service.geometry.rigid import heading_of_camera
@@ -117,7 +119,7 @@ def make_examples(work: Path, encoder: Path, cities: int, *, report: Report = la
             folder = work / f"map-{k}"
             if not folder.exists():
                 build_map(city, encoder, folder, BuildSettings(name=folder.name, calibration=None), report=report)
-            localizer = Localizer.open(MapBundle.open(folder))
+            localizer = Localizer.open(MapBundle.open(folder), verifier=EvenOdds())
             found = [*_examples(localizer, city, True, report)]
             if before is not None:
                 found += _examples(localizer, before, False, report)

@@ -23,7 +23,7 @@ from service.scoring.photometry import PhotometrySettings
 from service.scoring.ray_image import RayImage, inverse_of, ray_image_of
 from service.scoring.scorer import Scores
 from service.scoring.structure import HALF_PIXELS, INLIER_SIGMAS, MOST_SIGMAS, near_edges
-from service.scoring.verifier import Verifier
+from service.scoring.verifier import PoseVerifier
 
 #: A depth edge between two horizontal neighbours: the farther one is farther by more than EDGE_M plus EDGE_SHARE of the nearer depth, m.
 EDGE_M, EDGE_SHARE = 1.0, 0.05
@@ -189,7 +189,7 @@ class RayScorer:
         settings: RaySettings,
         weights: RayWeights,
         photometry: PhotometrySettings,
-        verifier: Verifier,
+        verifier: PoseVerifier,
     ) -> None:
         self._raycasters, self._settings, self._weights = raycasters, settings, weights
         self._photometry, self._verifier = photometry, verifier

@@ -9,6 +9,7 @@ calibrates it, and a part of the support of a pose.
 from collections.abc import Sequence
 from functools import cache
 from pathlib import Path
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float32
@@ -20,6 +21,21 @@ from service.scoring.comparison import COLUMNS, PLANES, ROWS, Comparison
 
 #: The verifier that belongs to this version of the program.
 SHIPPED = Path(__file__).with_name("verifier.onnx")
+#: What to do about a bad verifier of one's own, and about a bad one of this version of the program.
+_TRAIN, _INSTALL = "train it with `streetfix train-verifier`", "install Streetfix again"
+
+
+@runtime_checkable
+class PoseVerifier(Protocol):
+    """What the localizer needs of a verifier. The training uses one without a network."""
+
+    def log_odds(self, comparisons: Sequence[Comparison]) -> Float32[NDArray[np.float32], " n"]:
+        """Return for each comparison the log odds that its pose is within 1 m.
+
+        Args:
+            comparisons: comparisons of poses; may be empty.
+        """
+        ...
 
 
 class Verifier:
@@ -27,12 +43,13 @@ class Verifier:
 
     Args:
         session: session of ONNX Runtime with the network.
+        remedy: what to do if the network cannot be used.
 
     Raises:
         EncoderError: the network does not read single comparisons of this program, or does not return one number for each.
     """
 
-    def __init__(self, session: Session) -> None:
+    def __init__(self, session: Session, *, remedy: str = _TRAIN) -> None:
         self._session = session
         inputs = {each.name: list(each.shape) for each in session.get_inputs()}
         outputs = {each.name: list(each.shape) for each in session.get_outputs()}
@@ -42,32 +59,30 @@ class Verifier:
         if len(inputs) != 1 or planes != [len(PLANES), ROWS, COLUMNS] or fixed or not one_number:
             raise EncoderError(
                 f"the verifier reads {inputs} and returns {outputs}, but comparison -> log_odds are expected, {len(PLANES)} planes of "
-                f"{ROWS} x {COLUMNS} in a batch of 1 or of any size; train it with `streetfix train-verifier`",
+                f"{ROWS} x {COLUMNS} in a batch of 1 or of any size; {remedy}",
                 field="verifier",
             )
 
     @staticmethod
-    def open(source: Path) -> "Verifier":
+    def open(source: Path, *, remedy: str = _TRAIN) -> "Verifier":
         """Open a verifier.
 
         Args:
             source: path of the ONNX file.
+            remedy: what to do if the file cannot be used.
 
         Raises:
             EncoderError: the file cannot be read, or is no verifier.
         """
         try:
-            data = source.read_bytes()
+            session = session_of(source.read_bytes())
         except OSError as error:  # the text of the error names the file
-            raise EncoderError(f"the verifier cannot be read ({error}); check the path", field="verifier") from error
-        try:
-            session = session_of(data)
+            raise EncoderError(f"the verifier cannot be read ({error}); {remedy}", field="verifier") from error
         except Exception as error:  # the exceptions of ONNX Runtime have no common base class
             raise EncoderError(
-                f"{source}: ONNX Runtime cannot load the verifier ({error}); train it with `streetfix train-verifier`",
-                field="verifier",
+                f"{source}: ONNX Runtime cannot load the verifier ({error}); {remedy}", field="verifier"
             ) from error
-        return Verifier(session)
+        return Verifier(session, remedy=remedy)
 
     @staticmethod
     @cache
@@ -77,7 +92,7 @@ class Verifier:
         Raises:
             EncoderError: the file is missing or damaged.
         """
-        return Verifier.open(SHIPPED)
+        return Verifier.open(SHIPPED, remedy=_INSTALL)
 
     def log_odds(self, comparisons: Sequence[Comparison]) -> Float32[NDArray[np.float32], " n"]:
         """Return for each comparison the log odds that its pose is within 1 m.

@@ -52,6 +52,37 @@ def test_the_shipped_verifier_is_opened_once():
     assert Verifier.open(SHIPPED) is not Verifier.shipped()
 
 
+@pytest.fixture
+def shipped_at(monkeypatch):
+    """Return a function that opens a file as the shipped verifier."""
+
+    def opened(path):
+        monkeypatch.setattr("service.scoring.verifier.SHIPPED", path)
+        Verifier.shipped.cache_clear()
+        return Verifier.shipped()
+
+    yield opened
+    Verifier.shipped.cache_clear()
+
+
+def test_a_missing_shipped_file_needs_a_new_installation(shipped_at, tmp_path):
+    with pytest.raises(EncoderError, match=r"absent\.onnx.*; install Streetfix again$") as refused:
+        shipped_at(tmp_path / "absent.onnx")
+    assert refused.value.field == "verifier"
+
+
+@pytest.mark.parametrize("content", [b"no network", b""])
+def test_a_damaged_shipped_file_needs_a_new_installation(shipped_at, tmp_path, content):
+    (tmp_path / "bad.onnx").write_bytes(content)
+    with pytest.raises(EncoderError, match=r"bad\.onnx: ONNX Runtime cannot load.*; install Streetfix again$"):
+        shipped_at(tmp_path / "bad.onnx")
+
+
+def test_another_network_in_place_of_the_shipped_one_needs_a_new_installation(shipped_at):
+    with pytest.raises(EncoderError, match=r"comparison -> log_odds are expected.*; install Streetfix again$"):
+        shipped_at(ENCODER)
+
+
 def test_a_missing_file_is_named(tmp_path):
     with pytest.raises(EncoderError, match=r"absent\.onnx") as refused:
         Verifier.open(tmp_path / "absent.onnx")
