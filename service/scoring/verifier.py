@@ -64,23 +64,24 @@ class Verifier:
             )
 
     @staticmethod
-    def open(source: Path, *, remedy: str = _TRAIN) -> "Verifier":
-        """Open a verifier.
+    def open(source: Path | bytes, *, remedy: str = _TRAIN) -> "Verifier":
+        """Open a verifier from an ONNX file or from its bytes.
 
         Args:
-            source: path of the ONNX file.
+            source: path of the file, or its content.
             remedy: what to do if the file cannot be used.
 
         Raises:
             EncoderError: the file cannot be read, or is no verifier.
         """
+        named = "the content" if isinstance(source, bytes) else str(source)
         try:
-            session = session_of(source.read_bytes())
+            session = session_of(source if isinstance(source, bytes) else source.read_bytes())
         except OSError as error:  # the text of the error names the file
             raise EncoderError(f"the verifier cannot be read ({error}); {remedy}", field="verifier") from error
         except Exception as error:  # the exceptions of ONNX Runtime have no common base class
             raise EncoderError(
-                f"{source}: ONNX Runtime cannot load the verifier ({error}); {remedy}", field="verifier"
+                f"{named}: ONNX Runtime cannot load the verifier ({error}); {remedy}", field="verifier"
             ) from error
         return Verifier(session, remedy=remedy)
 

@@ -95,6 +95,13 @@ def test_a_damaged_file_is_named(tmp_path):
         Verifier.open(tmp_path / "bad.onnx")
 
 
+def test_the_content_of_a_file_is_a_verifier_too():
+    one = [comparison(agrees=True)]
+    assert Verifier.open(SHIPPED.read_bytes()).log_odds(one) == Verifier.shipped().log_odds(one)
+    with pytest.raises(EncoderError, match=r"the content: ONNX Runtime cannot load the verifier"):
+        Verifier.open(b"no network")
+
+
 def test_a_network_with_other_inputs_is_refused():
     with pytest.raises(
         EncoderError, match=r"comparison -> log_odds are expected.*12 planes of 64 x 128.*train-verifier"
