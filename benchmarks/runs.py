@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.report import ROOT, Report
+from model_training.calibration.answer_code import ENDINGS
 from model_training.cli.progress import bars
 from model_training.datasets.dataset import Dataset
 from model_training.evaluation.error_measures import wilson_interval
@@ -37,7 +38,7 @@ RAW_EVERY = 3
 
 @cache
 def code_hash(*names: str) -> str:
-    """Return a short hash of repository files, and of the Python and C files of folders.
+    """Return a short hash of repository files, and of the Python, C and ONNX files of folders.
 
     Args:
         *names: paths relative to the repository.
@@ -45,7 +46,7 @@ def code_hash(*names: str) -> str:
     digest = hashlib.sha256()
     for name in names:
         inside = [ROOT / name] if (ROOT / name).is_file() else (ROOT / name).rglob("*")
-        for path in sorted(p for p in inside if p.suffix in (".py", ".c", ".h")):
+        for path in sorted(p for p in inside if p.suffix in ENDINGS):
             digest.update(path.relative_to(ROOT).as_posix().encode() + b"\0" + path.read_bytes())
     return digest.hexdigest()[:8]
 

@@ -28,7 +28,7 @@ def export(net: EncoderNet, out: Path, *, trained_on: tuple[str, ...] = ()) -> f
         The greatest difference of a descriptor's component between torch and ONNX Runtime.
 
     Raises:
-        EncoderError: that difference exceeds ``TOLERANCE``; nothing is written.
+        EncoderError: that difference exceeds ``TOLERANCE`` or is no number; nothing is written.
     """
     net.eval()
     shape = net.shape
@@ -50,7 +50,7 @@ def export(net: EncoderNet, out: Path, *, trained_on: tuple[str, ...] = ()) -> f
     onnx.helper.set_model_props(model, {"trained_on": " ".join(trained_on)})
     data = bytes(model.SerializeToString())
     difference = _difference(net, Encoder.open(data))
-    if difference > TOLERANCE:
+    if not difference <= TOLERANCE:  # also refuses NaN
         raise EncoderError(f"ONNX and torch differ by {difference:.2e}, more than {TOLERANCE:.0e}; nothing was written")
     out.parent.mkdir(parents=True, exist_ok=True)
     part = out.with_name(out.name + ".part")
@@ -64,10 +64,10 @@ def _difference(net: EncoderNet, encoder: Encoder) -> float:
     rng = np.random.default_rng(0)
     planes = rng.uniform(0, 40, (7, len(PLANES), net.shape.rows, net.shape.columns)).astype(np.float32)
     planes[:, 0] *= rng.random(planes[:, 0].shape) > 0.3
-    worst = 0.0
+    differences = []
     for side, flag in (("survey", 0.0), ("query", 1.0)):
         with torch.no_grad():
             expected = net(torch.from_numpy(planes), torch.full((len(planes),), flag)).numpy()
         found = encoder.encode(planes, "survey" if side == "survey" else "query")
-        worst = max(worst, float(np.abs(expected - found).max()))
-    return worst
+        differences.append(np.abs(expected - found).max())
+    return float(np.max(differences))  # NaN if one of them is, which ``max`` would hide

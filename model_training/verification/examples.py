@@ -1,8 +1,9 @@
 """Examples for the verifier: comparisons of poses with maps, each with the distance to the true position.
 
-The localizer itself chooses the poses, so the wrong ones are those that look right to registration and to all scores. Images of the city
-before are asked in the map of a city: there every answer is wrong. Further poses start up to 8 m beside an answer and are adjusted to the
-map. They end in other minima near the right one.
+The localizer itself chooses the poses, so the wrong ones are those that look right to registration and to all other scores. No verifier
+takes part in the choice (``EvenOdds``), so a training does not depend on an earlier one. Images of the city before are asked in the map of
+a city: there every answer is wrong. Further poses start up to 8 m beside an answer and are adjusted to the map. They end in other minima
+near the right one.
 """
 
 import shutil
@@ -20,6 +21,7 @@ from model_training.evaluation.odometry import as_query
 from model_training.mapping.build import build_map
 from model_training.mapping.settings import BuildSettings
 from model_training.simulation.simulate import simulate
+from model_training.verification.even_odds import EvenOdds
 from model_training.verification.plans import verification_plan
 from service.errors import DatasetError, NoDepthError
 from service.geometry.rigid import heading_of_camera
@@ -27,7 +29,6 @@ from service.localization.localizer import Localizer
 from service.localization.refine import measured_frames
 from service.maps.reader import MapBundle
 from service.registration.visibility import Raycasters
-from service.retrieval.retrieve import EncodedFrame
 from service.scoring.candidates import Refined
 from service.scoring.comparison import COLUMNS, PLANES, ROWS
 from service.scoring.ray_evidence import RayPose, RayScorer
@@ -118,7 +119,7 @@ def make_examples(work: Path, encoder: Path, cities: int, *, report: Report = la
             folder = work / f"map-{k}"
             if not folder.exists():
                 build_map(city, encoder, folder, BuildSettings(name=folder.name, calibration=None), report=report)
-            localizer = Localizer.open(MapBundle.open(folder))
+            localizer = Localizer.open(MapBundle.open(folder), verifier=EvenOdds())
             found = [*_examples(localizer, city, True, report)]
             if before is not None:
                 found += _examples(localizer, before, False, report)
@@ -174,17 +175,21 @@ def _of_query(localizer: Localizer, frame: QueryFrame, own: bool) -> Examples | 
         encoded = localizer.encode_and_search(query)
     except NoDepthError:
         return None
-    refined = localizer.register((encoded,)).refined
-    if refined is None:
+    refined, cloud = localizer.register((encoded,)).refined, localizer.bundle.cloud
+    if refined is None or cloud is None:
         return None
+    measured, settings = measured_frames(localizer.bundle, (encoded,), localizer.refining)
+    rays = RayScorer(
+        Raycasters(cloud, settings.rays), measured, settings.rays, settings.support.rays, settings.photometry, localizer.verifier
+    )  # fmt: skip
     answer = refined.best.registered
     others = [each for each in refined.compared if each.pose is not answer][:_CANDIDATES]
     chosen = [each for each in refined.compared if each.pose is answer]
-    beside = _beside(localizer, encoded, refined) if own else []
+    beside = _beside(rays, refined) if own else []
     compared = [*chosen, *others, *beside]
     true_xy = None if frame.T_map_camera is None or not own else frame.T_map_camera[:2, 3]
     return Examples(
-        planes=np.stack([np.rint(STEPS * each.comparisons[0]).astype(np.int8) for each in compared]),
+        planes=np.stack([np.rint(STEPS * rays.comparisons(each.pose)[0]).astype(np.int8) for each in compared]),
         error_m=np.array(
             [
                 np.inf
@@ -198,15 +203,9 @@ def _of_query(localizer: Localizer, frame: QueryFrame, own: bool) -> Examples | 
     )
 
 
-def _beside(localizer: Localizer, frame: EncodedFrame, refined: Refined) -> list[RayPose]:
+def _beside(rays: RayScorer, refined: Refined) -> list[RayPose]:
     """Return poses that started beside the answer and were adjusted. The position of the answer decides the random numbers."""
-    answer, cloud = refined.best.registered, localizer.bundle.cloud
-    measured, settings = measured_frames(localizer.bundle, (frame,), localizer.refining)
-    if cloud is None:
-        return []
-    rays = RayScorer(
-        Raycasters(cloud, settings.rays), measured, settings.rays, settings.support.rays, settings.photometry, localizer.verifier
-    )  # fmt: skip
+    answer = refined.best.registered
     rng = np.random.default_rng(np.abs(answer.camera_m[:2] * 1e4).astype(np.int64))
     heading, found = heading_of_camera(refined.best.T_map_camera), []
     for _ in range(_BESIDE):

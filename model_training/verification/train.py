@@ -6,7 +6,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import onnx
 import torch
 from numpy.typing import NDArray
 from torch.nn.functional import binary_cross_entropy_with_logits
@@ -109,7 +108,7 @@ def export_verifier(net: VerifierNet, out: Path) -> float:
         The greatest difference between torch and ONNX Runtime.
 
     Raises:
-        EncoderError: that difference exceeds ``TOLERANCE``; nothing is written.
+        EncoderError: that difference exceeds ``TOLERANCE`` or is no number; nothing is written.
     """
     net.eval()
     example, buffer = torch.rand(2, len(PLANES), ROWS, COLUMNS) * 2 - 1, io.BytesIO()
@@ -126,13 +125,15 @@ def export_verifier(net: VerifierNet, out: Path) -> float:
         )
         net.eval()  # the tracing exporter leaves the module in training mode
         expected = net(example).numpy()
-    data = bytes(onnx.load_from_string(buffer.getvalue()).SerializeToString())
-    part = out.with_name(out.name + ".part")
+    data = buffer.getvalue()
+    difference = float(np.abs(Verifier.open(data).log_odds(list(example.numpy())) - expected).max())
+    if not difference <= TOLERANCE:  # also refuses NaN
+        raise EncoderError(
+            f"ONNX and torch differ by {difference:.2e}, more than {TOLERANCE:.0e}; nothing was written; train again with another --rate",
+            field="verifier",
+        )
     out.parent.mkdir(parents=True, exist_ok=True)
+    part = out.with_name(out.name + ".part")
     part.write_bytes(data)
-    difference = float(np.abs(Verifier.open(part).log_odds(list(example.numpy())) - expected).max())
-    if difference > TOLERANCE:
-        part.unlink()
-        raise EncoderError(f"ONNX and torch differ by {difference:.2e}, more than {TOLERANCE:.0e}; nothing was written")
     part.rename(out)
     return difference

@@ -18,7 +18,7 @@ from service.retrieval.hypotheses import ClusterSettings
 from service.retrieval.query import Query
 from service.retrieval.retrieve import EncodedFrame, encode_and_search, require_encoder_of, retrieve
 from service.retrieval.starts import start_positions_m
-from service.scoring.verifier import Verifier
+from service.scoring.verifier import PoseVerifier, Verifier
 from service.timing import stage, timed_request
 
 
@@ -30,7 +30,7 @@ class Localizer:
         encoder: encoder that computed the map's descriptors.
         clusters: settings of the clustering; None for the defaults.
         refining: settings of registration and scoring; None for the defaults.
-        verifier: network that compares poses with the map; None for the shipped one.
+        verifier: compares poses with the map; None for the shipped one.
 
     Raises:
         EncoderError: the shipped verifier is missing or damaged.
@@ -45,27 +45,28 @@ class Localizer:
         *,
         clusters: ClusterSettings | None = None,
         refining: RefineSettings | None = None,
-        verifier: Verifier | None = None,
+        verifier: PoseVerifier | None = None,
     ) -> None:
         require_encoder_of(bundle, encoder)
         require_features(bundle.calibration, str(bundle.path))
         self.bundle, self.encoder = bundle, encoder
         self.clusters, self.refining = clusters or ClusterSettings(), refining or RefineSettings()
-        self.verifier = verifier or Verifier.shipped()
+        self.verifier: PoseVerifier = verifier or Verifier.shipped()
         self.extent = Extent.of_places(bundle.T_map_place[:, :3, 3], bundle.manifest.spacing_m)
 
     @classmethod
-    def open(cls, bundle: Map, *, provider: Provider = "cpu") -> "Localizer":
+    def open(cls, bundle: Map, *, provider: Provider = "cpu", verifier: PoseVerifier | None = None) -> "Localizer":
         """Create a localizer with the encoder that the bundle contains.
 
         Args:
             bundle: the map.
-            provider: execution provider that runs the network.
+            provider: execution provider that runs the encoder.
+            verifier: compares poses with the map; None for the shipped one.
 
         Raises:
-            EncoderError: the provider is not installed.
+            EncoderError: the provider is not installed, or the encoder or the shipped verifier cannot be used.
         """
-        return cls(bundle, Encoder.open(bundle.encoder_bytes(), provider=provider))
+        return cls(bundle, Encoder.open(bundle.encoder_bytes(), provider=provider), verifier=verifier)
 
     def localize(self, query: Query) -> Answer:
         """Answer a query.

@@ -38,7 +38,7 @@ from service.scoring.ray_evidence import RayPose, RayScorer
 from service.scoring.similarity import similarity_of
 from service.scoring.structure import StructureScorer
 from service.scoring.support import LocalScoreWeights, PoseScorer, SupportWeights, scorers_of
-from service.scoring.verifier import Verifier
+from service.scoring.verifier import PoseVerifier
 
 _Covariance = Float64[NDArray[np.float64], "6 6"]
 
@@ -122,7 +122,7 @@ def refine(
     frames: tuple[EncodedFrame, ...],
     prior: Prior | None,
     settings: RefineSettings,
-    verifier: Verifier,
+    verifier: PoseVerifier,
     predicted: tuple[Transform, ...] = (),
 ) -> Refined | None:
     """Register image pairs on the map cloud; return None if they have too few points.
@@ -190,7 +190,7 @@ def _scorer_of(
     measured: tuple[MeasuredFrame, ...],
     prior: Prior | None,
     settings: RefineSettings,
-    verifier: Verifier,
+    verifier: PoseVerifier,
 ) -> PoseScorer:
     """Return the scorer of the candidates of one query."""
     return PoseScorer(

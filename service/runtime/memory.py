@@ -14,8 +14,10 @@ if TYPE_CHECKING:
 
 #: Minimum memory of a process without requests: packages, encoder, tables of a map. A larger measured value replaces it.
 PROCESS_BYTES = 192 * MIB
-#: Memory of a thread for one answer, besides the images: descriptors, points, candidates. Measured: 7 MiB; 20 MiB for a stock map.
-THREAD_BYTES = 32 * MIB
+#: Memory of a thread for one answer, besides the images. Measured with tracemalloc (November 2026, stock encoder, images of 640 x 480):
+#: 7 MiB for one frame, 24 MiB for 4, 71 MiB for 16, the most of a request. Most of it are the surfels in view of each frame and the surfel
+#: of each ray at each pose. ONNX Runtime's own memory of a run is not in these figures.
+THREAD_BYTES = 80 * MIB
 #: Share of the limit that stays free, for fragmentation, sockets, connections and further map versions.
 SPARE_SHARE = 0.125
 #: Share of the limit for pages of maps, also if the maps are mounted later. The system can read such pages again from the files, but

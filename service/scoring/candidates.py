@@ -65,7 +65,7 @@ class Refined:
         confirmation: comparison of the best pose with poses next to it.
         ray_evidence: comparison of the depth with the map along the rays of the best pose.
         verified: log odds of the verifier that the best pose is right.
-        compared: all poses that were compared along the rays, for the training of the verifier.
+        compared: all poses that were compared along the rays. The training of the verifier compares them again.
         covariance_at: function that computes the covariance of a candidate without ray adjustment: of every one but the best.
     """
 

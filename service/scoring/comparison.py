@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from service.registration.surfel_tiles import Surfels
 from service.scoring.measured import MeasuredFrame
-from service.scoring.photometry import PhotometrySettings, grey_of, mapped_brightness
+from service.scoring.photometry import PhotometrySettings, grey_of, mapped_brightness, seen_by_lens
 from service.scoring.ray_image import RayImage, inverse_of
 
 #: Planes of a comparison, in their order.
@@ -64,7 +64,7 @@ class FrameCells:
     Attributes:
         pixel: index of the pixel in the flat small image; 0 where there is none.
         in_view: whether a pixel shows the direction.
-        brightness: logarithm of the grey level minus the mean of the image.
+        brightness: logarithm of the grey level minus its mean over the pixels that the lens saw; 0 where it saw nothing.
     """
 
     pixel: Int64[NDArray[np.int64], "64 128"]
@@ -89,8 +89,22 @@ class FrameCells:
         v = np.rint(rays[..., 1] / z * camera.fy + camera.cy).astype(np.int64)
         in_view = ahead & (u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height)
         pixel = np.where(in_view, v * camera.width + u, 0)
-        grey = grey_of(measured.frame.query.rgb, camera, measured.blocks.covered, settings)
-        return cls(pixel, in_view, np.where(in_view, (grey - grey.mean()).ravel()[pixel], np.float32(0)))
+        brightness = _brightness_of(measured, settings).ravel()[pixel]
+        return cls(pixel, in_view, np.where(in_view, brightness, np.float32(0)))
+
+
+def _brightness_of(measured: MeasuredFrame, settings: PhotometrySettings) -> Float32[NDArray[np.float32], "H W"]:
+    """Return the logarithm of the grey level of each pixel of the small image minus its mean.
+
+    Pixels that the lens did not see are black after the rectification. They do not count in the mean, and their brightness is 0.
+    """
+    query, camera, covered = measured.frame.query, measured.picture.camera, measured.blocks.covered
+    grey = grey_of(query.rgb, camera, covered, settings)
+    if query.observed is None:
+        return np.asarray(grey - grey.mean())
+    seen = seen_by_lens(query.observed, camera, covered)
+    mean = grey[seen].mean() if seen.any() else np.float32(0)
+    return np.where(seen, grey - mean, np.float32(0))
 
 
 def comparison_of(
@@ -104,20 +118,24 @@ def comparison_of(
         surfels: surfels of the map, whose brightness is shown; None if brightness is not compared.
         settings: settings of the brightness.
     """
-    inverse, mapped_inverse = inverse_of(image.z_m), inverse_of(image.mapped_m)
-    known, hit = image.z_m > 0, image.mapped_m > 0
+    # Only the pixels of the cells are computed: a tall image has a hundred times as many. The mean of the map's brightness needs all.
+    z_m, mapped_m, sigma, climb = (
+        each.ravel()[cells.pixel] for each in (image.z_m, image.mapped_m, image.sigma, image.climb)
+    )
+    inverse, mapped_inverse = inverse_of(z_m), inverse_of(mapped_m)
+    known, hit = z_m > 0, mapped_m > 0
     both = known & hit
-    sigmas = np.where(both, (inverse - mapped_inverse) / image.sigma, 0.0)
-    ratio = np.where(both, inverse * image.mapped_m - 1.0, 0.0)
+    sigmas = np.where(both, (inverse - mapped_inverse) / sigma, 0.0)
+    ratio = np.where(both, inverse * mapped_m - 1.0, 0.0)
     heights = (
-        np.where(seen, np.clip((z * image.climb + image.camera_m) / _HEIGHT_M, _BELOW, 1.0), 0.0)
-        for z, seen in ((image.z_m, known), (image.mapped_m, hit))
+        np.where(seen, np.clip((z * climb + image.camera_m) / _HEIGHT_M, _BELOW, 1.0), 0.0)
+        for z, seen in ((z_m, known), (mapped_m, hit))
     )
     if surfels is not None and surfels.has_brightness:
-        shown = np.nan_to_num(mapped_brightness(surfels, image.surfel_of, settings))
+        shown = np.nan_to_num(mapped_brightness(surfels, image.surfel_of, settings).ravel()[cells.pixel])
     else:
-        shown = np.zeros(image.z_m.shape, np.float32)
-    planes = np.stack(
+        shown = np.zeros(cells.pixel.shape, np.float32)
+    planes: Comparison = np.stack(
         [
             known,
             hit,
@@ -126,12 +144,10 @@ def comparison_of(
             np.tanh(sigmas / _SIGMAS),
             np.tanh(ratio / _RATIO),
             *heights,
-            np.minimum(image.sigma * image.mapped_m, 1.0),
-            np.zeros(image.z_m.shape),
+            np.minimum(sigma * mapped_m, 1.0),
+            np.clip(cells.brightness / _LOG_BRIGHTNESS, -1.0, 1.0),
             np.clip(shown / _LOG_BRIGHTNESS, -1.0, 1.0),
-            np.ones(image.z_m.shape),
+            cells.in_view,
         ]
     ).astype(np.float32)
-    found = planes.reshape(len(PLANES), -1)[:, cells.pixel] * cells.in_view
-    found[PLANES.index("brightness")] = np.clip(cells.brightness / _LOG_BRIGHTNESS, -1.0, 1.0)
-    return found.astype(np.float32)
+    return planes * cells.in_view

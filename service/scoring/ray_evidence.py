@@ -6,7 +6,7 @@ higher, and it is still there. Rays also resolve more than the image of ``struct
 Right and wrong answers have the same numbers in simulated cities and on KITTI drive 0005 (decision 0201).
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import astuple, dataclass
 
 import numpy as np
@@ -16,14 +16,14 @@ from numpy.typing import NDArray
 from service.registration.points import GROUND_M, MOVABLE_M
 from service.registration.rays import RaySettings, adjust
 from service.registration.register import Registered
-from service.registration.visibility import Raycasters
+from service.registration.visibility import Raycasters, SurfelRaycaster
 from service.scoring.comparison import Comparison, FrameCells, comparison_of
 from service.scoring.measured import MeasuredFrame
 from service.scoring.photometry import PhotometrySettings
-from service.scoring.ray_image import RayImage, inverse_of, ray_images_of
+from service.scoring.ray_image import RayImage, inverse_of, ray_image_of
 from service.scoring.scorer import Scores
 from service.scoring.structure import HALF_PIXELS, INLIER_SIGMAS, MOST_SIGMAS, near_edges
-from service.scoring.verifier import Verifier
+from service.scoring.verifier import PoseVerifier
 
 #: A depth edge between two horizontal neighbours: the farther one is farther by more than EDGE_M plus EDGE_SHARE of the nearer depth, m.
 EDGE_M, EDGE_SHARE = 1.0, 0.05
@@ -65,13 +65,13 @@ class RayWeights:
     verified: float = 0.6
 
 
-def ray_evidence(images: Sequence[RayImage]) -> RayEvidence:
-    """Compute the numbers of a pose.
+def mean_evidence(frames: Sequence[RayEvidence]) -> RayEvidence:
+    """Compute the numbers of a pose from those of its frames.
 
     Args:
-        images: depth of each frame and of the map along the same rays, at least one.
+        frames: numbers of each frame, at least one.
     """
-    return RayEvidence(*np.mean([astuple(ray_evidence_of(image)) for image in images], axis=0).tolist())
+    return RayEvidence(*np.mean([astuple(each) for each in frames], axis=0).tolist())
 
 
 def ray_evidence_of(image: RayImage) -> RayEvidence:
@@ -157,14 +157,12 @@ class RayPose:
         pose: the adjusted pose, or the registered one if too few rays meet the map.
         scatter: scatter of the patches' gradients there, as ``adjust`` returns it; None if the pose was not adjusted.
         evidence: comparison with the map along the rays of this pose.
-        comparisons: the same for the verifier, for each frame.
         verified: mean log odds of the frames, by the verifier, that the pose is right.
     """
 
     pose: Registered
     scatter: Float64[NDArray[np.float64], "8 8"] | None
     evidence: RayEvidence
-    comparisons: tuple[Comparison, ...]
     verified: float
 
 
@@ -191,7 +189,7 @@ class RayScorer:
         settings: RaySettings,
         weights: RayWeights,
         photometry: PhotometrySettings,
-        verifier: Verifier,
+        verifier: PoseVerifier,
     ) -> None:
         self._raycasters, self._settings, self._weights = raycasters, settings, weights
         self._photometry, self._verifier = photometry, verifier
@@ -216,16 +214,31 @@ class RayScorer:
                 return found
         raycaster = self._raycasters.at(pose.camera_m)
         adjusted, scatter = adjust(raycaster, self._pictures, pose, self._settings) or (pose, None)
-        images = ray_images_of(raycaster, self._measured, adjusted)
-        surfels = raycaster.cloud if self._raycasters.have_brightness else None
-        comparisons = tuple(
-            comparison_of(cells, image, surfels, self._photometry)
-            for cells, image in zip(self._cells, images, strict=True)
-        )
-        verified = float(self._verifier.log_odds(comparisons).mean())
-        found = RayPose(adjusted, scatter, ray_evidence(images), comparisons, verified)
+        evidence, odds = [], []
+        for image, comparison in self._compared_at(raycaster, adjusted):
+            evidence.append(ray_evidence_of(image))
+            odds.append(self._verifier.log_odds([comparison]))
+        found = RayPose(adjusted, scatter, mean_evidence(evidence), float(np.concatenate(odds).mean()))
         self._known.append((pose, found))
         return found
+
+    def comparisons(self, pose: Registered) -> tuple[Comparison, ...]:
+        """Compare a pose with the map as it is, and return what the verifier sees of each frame.
+
+        The training of the verifier needs these arrays, and no answer does. So they are computed again instead of kept.
+
+        Args:
+            pose: pose of the reference's level frame, for example an adjusted one.
+        """
+        raycaster = self._raycasters.at(pose.camera_m)
+        return tuple(comparison for _, comparison in self._compared_at(raycaster, pose))
+
+    def _compared_at(self, raycaster: SurfelRaycaster, pose: Registered) -> Iterator[tuple[RayImage, Comparison]]:
+        """Yield the depth along the rays of each frame, and the comparison for the verifier. Only one frame at a time is in memory."""
+        surfels = raycaster.cloud if self._raycasters.have_brightness else None
+        for cells, each in zip(self._cells, self._measured, strict=True):
+            image = ray_image_of(raycaster, each, each.pose(pose))
+            yield image, comparison_of(cells, image, surfels, self._photometry)
 
     def score(self, poses: tuple[Registered, ...]) -> Scores:
         """Return the score of each pose: inliers, shared edges and the verifier with their weights. It has no details.

@@ -65,16 +65,3 @@ def inverse_of(values: Float64[NDArray[np.float64], "H W"]) -> Float64[NDArray[n
         values: depths, m, or inverse depths, 1/m; 0 where unknown.
     """
     return np.divide(1.0, values, out=np.zeros(values.shape), where=values > 0)
-
-
-def ray_images_of(
-    raycaster: SurfelRaycaster, measured: tuple[MeasuredFrame, ...], pose: Registered
-) -> tuple[RayImage, ...]:
-    """Return the depth of each frame and of the map along the same rays.
-
-    Args:
-        raycaster: ray casting on the map.
-        measured: frames of the query.
-        pose: registered pose of the reference's level frame.
-    """
-    return tuple(ray_image_of(raycaster, each, each.pose(pose)) for each in measured)

@@ -1,3 +1,4 @@
+import pickle
 from dataclasses import replace
 
 import numpy as np
@@ -462,6 +463,13 @@ def test_the_evidence_along_the_rays_is_that_of_the_final_pose(bundle, cloud, de
     assert found.ray_evidence == final.evidence
     assert found.verified == final.verified
     assert found.ray_evidence.static_inliers > 0.5
+
+
+def test_a_result_keeps_no_images_of_the_poses_that_were_compared(bundle, cloud, depth, here, seen_in):
+    """A comparison of one frame has 393,216 bytes. A pose with its scatter and its numbers has about two thousand."""
+    found = always_refined(bundle, cloud, (seen_in(depth, here),), None, RefineSettings())
+    assert found.compared
+    assert len(pickle.dumps(found.compared)) < 4000 * len(found.compared)
 
 
 def test_with_too_few_intersections_pose_and_covariance_are_those_of_the_points(

@@ -90,6 +90,14 @@ def test_the_exported_encoder_is_one_file_that_knows_its_grid(net, shape, tmp_pa
     assert difference < 1e-4
 
 
+def test_a_network_with_weights_that_are_no_numbers_is_not_written(net, tmp_path):
+    with torch.no_grad():
+        next(net.parameters()).fill_(np.nan)
+    with pytest.raises(EncoderError, match=r"differ by nan.*nothing was written"):
+        export(net, tmp_path / "encoder.onnx")
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_an_export_that_differs_is_refused_and_nothing_is_written(net, tmp_path, monkeypatch):
     monkeypatch.setattr("model_training.training.export.TOLERANCE", -1.0)
     with pytest.raises(EncoderError, match="nothing was written"):

@@ -2,16 +2,18 @@ import numpy as np
 import pytest
 
 from model_training.verification import examples
+from model_training.verification.even_odds import EvenOdds
 from model_training.verification.examples import ANSWER, BESIDE, CANDIDATE, STEPS, Examples, make_examples
-from service.errors import DatasetError
+from service.errors import DatasetError, EncoderError
 from service.localization.localizer import Localizer
 from service.maps.reader import MapBundle
 from service.scoring.comparison import COLUMNS, PLANES, ROWS
+from service.scoring.verifier import Verifier
 
 
 @pytest.fixture(scope="module")
 def localizer(small_map):
-    return Localizer.open(MapBundle.open(small_map))
+    return Localizer.open(MapBundle.open(small_map), verifier=EvenOdds())
 
 
 def silent(*_):
@@ -33,6 +35,21 @@ def test_a_query_of_the_map_gives_its_answer_and_poses_beside_it(localizer, smal
         assert each.error_m[0] == pytest.approx(error_m, abs=1e-3)
         assert (each.planes[:, PLANES.index("in_view")] >= 0).all()
         assert each.planes.max() == STEPS
+
+
+def test_examples_need_no_earlier_verifier(small_map, small_dataset, monkeypatch):
+    def missing():
+        raise EncoderError("the verifier is missing")
+
+    monkeypatch.setattr(Verifier, "shipped", missing)
+    own = Localizer.open(MapBundle.open(small_map), verifier=EvenOdds())
+    frame = next(iter(small_dataset.queries("drive1_precise")))
+    assert examples._of_query(own, frame, True) is not None
+    refined = own.register((own.encode_and_search(frame.query(own.bundle.grid)),)).refined
+    assert refined is not None
+    assert refined.verified == 0.0
+    with pytest.raises(EncoderError, match="is missing"):
+        Localizer.open(MapBundle.open(small_map))
 
 
 def test_every_pose_is_wrong_on_the_map_of_another_city(localizer, small_dataset):
@@ -77,11 +94,15 @@ def recorded(monkeypatch):
             np.zeros((1, len(PLANES), ROWS, COLUMNS), np.int8), np.zeros(1, np.float32), np.zeros(1, np.uint8)
         )
 
+    def opened(bundle, verifier):
+        assert isinstance(verifier, EvenOdds)
+        return bundle
+
     monkeypatch.setattr(examples, "simulate", simulated)
     monkeypatch.setattr(examples, "build_map", mapped)
     monkeypatch.setattr(examples, "Dataset", City)
     monkeypatch.setattr(MapBundle, "open", lambda path: path.name)
-    monkeypatch.setattr(Localizer, "open", lambda bundle: bundle)
+    monkeypatch.setattr(Localizer, "open", opened)
     monkeypatch.setattr(examples, "_examples", found)
     return asked
 

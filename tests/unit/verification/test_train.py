@@ -67,6 +67,26 @@ def test_a_network_that_onnx_runtime_computes_otherwise_is_not_written(tmp_path,
     assert not list(tmp_path.iterdir())
 
 
+def test_a_network_with_weights_that_are_no_numbers_is_not_written(tmp_path):
+    net = VerifierNet()
+    with torch.no_grad():
+        next(net.head.parameters()).fill_(np.nan)
+    with pytest.raises(EncoderError, match=r"differ by nan.*nothing was written; train again") as refused:
+        export_verifier(net, tmp_path / "verifier.onnx")
+    assert refused.value.field == "verifier"
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_network_that_cannot_be_opened_is_not_written(tmp_path, monkeypatch):
+    def refused(_):
+        raise EncoderError("the verifier returns something else")
+
+    monkeypatch.setattr(Verifier, "open", refused)
+    with pytest.raises(EncoderError, match="something else"):
+        export_verifier(VerifierNet(), tmp_path / "verifier.onnx")
+    assert not list(tmp_path.iterdir())
+
+
 def test_examples_survive_a_file(tmp_path):
     city(3).write(tmp_path / "examples.npz")
     found = Examples.read(tmp_path / "examples.npz")
