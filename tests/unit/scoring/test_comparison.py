@@ -48,15 +48,15 @@ def measured_with(frame_with, matches_at):
     return measured
 
 
-def image_of(one, z_m, mapped_m, sigma=0.01):
-    """Return an image of equal rays."""
+def image_of(one, z_m, mapped_m, sigma=0.01, climb=0.0, surfel_of=-1):
+    """Return an image of equal rays, or of rays with these surfels."""
     shape = (one.picture.camera.height, one.picture.camera.width)
     return RayImage(
-        surfel_of=np.full(shape, -1, np.int32),
+        surfel_of=np.broadcast_to(np.asarray(surfel_of, np.int32), shape).copy(),
         z_m=np.full(shape, float(z_m)),
         mapped_m=np.full(shape, float(mapped_m)),
         sigma=np.full(shape, sigma),
-        climb=np.zeros(shape),
+        climb=np.full(shape, climb),
         camera_m=1.5,
     )
 
@@ -107,14 +107,20 @@ def test_the_grid_has_equal_angles(measured_with):
 
 
 def test_a_camera_that_looks_down_has_the_same_directions(measured_with):
-    """The horizon moves up in the image, not in the grid."""
-    pitch = np.deg2rad(10.0)
+    """The horizon moves up in the image, not in the grid.
+
+    The upper edge of the image is at tan(45 / 60) = 36.87 degrees above the axis, so at 16.87 degrees above the horizon. Row 9 of the grid
+    is at 16.875 degrees.
+    """
+    pitch = np.deg2rad(20.0)
     down = np.array([[np.cos(pitch), 0, np.sin(pitch)], [0, 1, 0], [-np.sin(pitch), 0, np.cos(pitch)]])
     one = measured_with(R=down @ LEVEL)
     cells, camera = FrameCells.of(one, PHOTOMETRY), one.picture.camera
     v = cells.pixel[ROWS // 2, COLUMNS // 2] // camera.width
     assert v == pytest.approx(camera.cy - camera.fy * np.tan(pitch), abs=1.5)
-    assert not cells.in_view[-1].any() or cells.in_view.mean() < 1
+    middle = cells.in_view[:, COLUMNS // 2]
+    assert not middle[:9].any()
+    assert middle[10:].all()
 
 
 def test_directions_outside_of_the_image_are_empty(measured_with, surfels):
@@ -150,6 +156,17 @@ def test_differences_have_the_sign_of_the_nearer_side(measured_with, surfels):
     np.testing.assert_allclose(found["difference_ratio"][inside], np.tanh(3.0), rtol=1e-6)
     behind = planes(one, surfels, image_of(one, 16, 8, sigma=0.05))
     np.testing.assert_allclose(behind["difference_sigmas"][inside], -np.tanh(1.25 / 4), rtol=1e-6)
+
+
+def test_a_ray_that_climbs_ends_higher(measured_with, surfels):
+    """1.5 m, and 0.25 m for each metre of depth: 3.5 m at 8 m and 2.5 m at 4 m. Downwards: 0.5 m at 4 m, and the least height at 20 m."""
+    one = measured_with()
+    up, down = (planes(one, surfels, image_of(one, z, 4, climb=climb)) for z, climb in ((8, 0.25), (20, -0.25)))
+    inside = up["in_view"] > 0
+    np.testing.assert_allclose(up["height"][inside], 0.35, rtol=1e-6)
+    np.testing.assert_allclose(up["mapped_height"][inside], 0.25, rtol=1e-6)
+    np.testing.assert_allclose(down["height"][inside], -0.2, rtol=1e-6)
+    np.testing.assert_allclose(down["mapped_height"][inside], 0.05, rtol=1e-6)
 
 
 @pytest.mark.parametrize(("z_m", "mapped_m"), [(0, 8), (8, 0), (0, 0)])
@@ -233,19 +250,47 @@ def test_each_cell_shows_what_the_whole_image_has_at_its_pixel(street_map, seed)
     assert (found[PLANES.index("mapped_brightness")] != 0).mean() > 0.3
 
 
-def test_without_surfels_the_brightness_of_the_map_is_not_shown(measured_with, surfels):
-    one = measured_with()
-    shown, hidden = (planes(one, each, image_of(one, 8, 8)) for each in (surfels, None))
+@pytest.fixture
+def bright(street_map):
+    """Return surfels of intensity 10 and 30, and some without, and a surfel of each of these three kinds."""
+    cloud = with_brightness(street_map, np.resize([10.0, 30.0, np.nan], len(street_map.surfels)))
+    values = cloud.brightness_of(np.arange(len(cloud.surfels)))
+    return cloud, *(int(np.flatnonzero(each)[0]) for each in (values == 10, values == 30, np.isnan(values)))
+
+
+def test_each_cell_shows_the_brightness_of_the_surfel_at_its_pixel(measured_with, bright):
+    """The left third of the image meets a surfel of 10, the middle one of 30, and the rest none or one without an intensity.
+
+    The known mean is 20. The logarithms of 0.5 and 1.5, with a dark share of 0.03, fill the scale at 3.
+    """
+    cloud, dark, light, unknown = bright
+    one, surfel_of = measured_with(), np.full((90, 120), -1)
+    surfel_of[:, :40], surfel_of[:, 40:80], surfel_of[::2, 80:] = dark, light, unknown
+    found = planes(one, cloud, image_of(one, 8, 8, surfel_of=surfel_of))
+    inside, column = found["in_view"] > 0, FrameCells.of(one, PHOTOMETRY).pixel % 120
+    for which, expected in ((column < 40, np.log(0.53) / 3), ((column >= 40) & (column < 80), np.log(1.53) / 3)):
+        np.testing.assert_allclose(found["mapped_brightness"][inside & which], expected, rtol=1e-5)
+        assert (inside & which).any()
+    assert (found["mapped_brightness"][inside & (column >= 80)] == 0).all()
+
+
+def test_without_surfels_the_brightness_of_the_map_is_not_shown(measured_with, bright):
+    cloud, dark, light, _ = bright
+    one, surfel_of = measured_with(), np.full((90, 120), dark)
+    surfel_of[:45] = light
+    shown, hidden = (planes(one, each, image_of(one, 8, 8, surfel_of=surfel_of)) for each in (cloud, None))
     for name in PLANES:
         if name != "mapped_brightness":
             np.testing.assert_array_equal(shown[name], hidden[name])
+    inside = shown["in_view"] > 0
+    assert (np.abs(shown["mapped_brightness"][inside]) > 0.1).all()
     assert (hidden["mapped_brightness"] == 0).all()
 
 
 def test_a_map_without_brightness_has_none(measured_with, street_map):
     raycaster = SurfelRaycaster(street_map, RaySettings())
     one = measured_with()
-    found = planes(one, raycaster.cloud, image_of(one, 8, 8))
+    found = planes(one, raycaster.cloud, image_of(one, 8, 8, surfel_of=0))
     assert (found["mapped_brightness"] == 0).all()
 
 
@@ -264,3 +309,10 @@ def test_the_right_pose_agrees_with_the_map(street_map, frame_with, matches_at, 
     assert both.mean() > 0.3
     assert (np.abs(right["difference_ratio"][both]) > 0.1).mean() < 0.05
     assert (np.abs(wrong["difference_ratio"][both]) > 0.1).mean() > 0.2
+    # The lowest rows show the ground, and the upper ones walls higher than the camera.
+    assert np.abs(right["height"][-8:][both[-8:]]).max() < 0.02
+    assert np.abs(right["mapped_height"][-8:][both[-8:]]).max() < 0.02
+    assert right["height"][: ROWS // 2 - 4][both[: ROWS // 2 - 4]].min() > 0.15
+    assert right["mapped_height"][: ROWS // 2 - 4][both[: ROWS // 2 - 4]].min() > 0.15
+    assert both[-8:].any()
+    assert both[: ROWS // 2 - 4].any()

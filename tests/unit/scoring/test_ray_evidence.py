@@ -9,8 +9,10 @@ from service.geometry.camera import PinholeCamera
 from service.registration.points import PointSettings
 from service.registration.rays import RaySettings, adjust
 from service.registration.surfel_map import SurfelMap
+from service.registration.surfel_tiles import SurfelTiles
 from service.registration.visibility import Raycasters, SurfelRaycaster
 from service.scoring import ray_evidence as along_rays
+from service.scoring.comparison import PLANES, FrameCells
 from service.scoring.measured import measure
 from service.scoring.photometry import PhotometrySettings
 from service.scoring.ray_evidence import RayScorer, RayWeights, mean_evidence, ray_evidence_of
@@ -289,3 +291,93 @@ def test_the_comparisons_of_a_pose_are_those_that_the_verifier_saw(street_map, m
     np.testing.assert_array_equal(scorer.comparisons(found.pose), verifier.asked)
     other = scorer.comparisons(candidate(xyz=(0.3, 0.0, 1.5)).registered)
     assert np.abs(other[0] - verifier.asked[0]).max() > 0.1
+
+
+IN_VIEW, MAPPED, MAPPED_BRIGHTNESS = (PLANES.index(name) for name in ("in_view", "mapped", "mapped_brightness"))
+
+
+@pytest.fixture
+def two_frames(frame_with, matches_at, candidate, raycaster):
+    """Return two frames of different cameras: at the pose of ``candidate``, and 3 m ahead with a narrow field of view."""
+    frame, pose = frame_with(matches_at([(0, 0, 2)], [0], [0.9])), candidate(xyz=(0.0, 0.0, 1.5)).registered
+    ahead, frames = np.eye(4), []
+    ahead[2, 3] = 3.0
+    for T_reference_camera, focal_px in ((np.eye(4), 60.0), (ahead, 120.0)):
+        camera = PinholeCamera(120, 90, focal_px, focal_px, 59.5, 44.5)
+        T = frame.pose_of_camera(pose.T_map_level) @ T_reference_camera
+        seen = replace(frame.query, depth_m=raycaster.depth(T, camera).astype(np.float32), camera=camera)
+        frames.append(replace(frame, query=seen, T_reference_camera=T_reference_camera))
+    return measure(tuple(frames), PointSettings(), focal_baseline_px_m=80.0, is_rig=True)
+
+
+def test_the_verifier_sees_every_frame_in_its_own_cells_and_their_mean_counts(street_map, two_frames, candidate):
+    verifier = Listening(3.0, 0.5)
+    found = scorer_of(street_map, two_frames, verifier=verifier).at(candidate(xyz=(0.0, 0.0, 1.5)).registered)
+    assert found.verified == 1.75
+    assert len(verifier.asked) == 2
+    own = [FrameCells.of(each, PhotometrySettings()).in_view for each in two_frames]
+    for comparison, in_view in zip(verifier.asked, own, strict=True):
+        np.testing.assert_array_equal(comparison[IN_VIEW] == 1, in_view)
+    assert own[1].sum() < 0.7 * own[0].sum()
+    for comparison in verifier.asked:  # both frames measure the map as it is from their own positions
+        both = (comparison[PLANES.index("measured")] > 0) & (comparison[MAPPED] > 0)
+        assert both.sum() > 1000
+        assert (np.abs(comparison[PLANES.index("difference_ratio")][both]) > 0.1).mean() < 0.05
+
+
+@pytest.mark.parametrize("odds", [-2.0, 0.0, 5.0])
+def test_the_log_odds_of_the_verifier_enter_the_score(street_map, measured, candidate, odds):
+    pose = candidate(xyz=(0.0, 0.0, 1.5)).registered
+    plain, judged = (
+        scorer_of(street_map, measured, verifier=Listening(each)).score((pose,)).values[0] for each in (0.0, odds)
+    )
+    assert judged == pytest.approx(plain + 0.6 * odds)
+
+
+def test_the_shipped_verifier_prefers_the_right_pose(street_map, measured, candidate):
+    """The others are 3 m beside it, turned by 30 degrees, and 9 m behind it. The ray adjustment moves a pose by decimetres only."""
+    scorer = scorer_of(street_map, measured)
+    right, *wrong = (
+        scorer.at(candidate(xyz=xyz, heading_deg=heading).registered).verified
+        for xyz, heading in (
+            ((0.0, 0.0, 1.5), 0.0),
+            ((0.0, 3.0, 1.5), 0.0),
+            ((0.0, 0.0, 1.5), 30.0),
+            ((-9.0, 0.0, 1.5), 0.0),
+        )
+    )
+    assert right > max(wrong) + 1
+
+
+@pytest.fixture
+def bright_map(street_map):
+    """Return the street with intensities of 30 on its left side and 10 on its right side."""
+    surfels = street_map.unpacked(np.s_[:])
+    intensities = np.where(surfels["xyz"][:, 1] > 0, 30, 10).astype(np.float32)
+    return SurfelMap.prepare(street_map.origin_m, surfels, intensities)
+
+
+def test_the_verifier_sees_the_brightness_of_the_map_on_its_side_of_the_street(bright_map, measured, candidate):
+    verifier = Listening(0.0)
+    scorer_of(bright_map, measured, verifier=verifier).at(candidate(xyz=(0.0, 0.0, 1.5)).registered)
+    (comparison,) = verifier.asked
+    hit = comparison[MAPPED] == 1
+    left, right = (comparison[MAPPED_BRIGHTNESS][:, side][hit[:, side]] for side in (np.s_[:60], np.s_[68:]))
+    assert left.size > 1000
+    assert right.size > 1000
+    assert left.min() > 0.05
+    assert right.max() < -0.05
+    assert (comparison[MAPPED_BRIGHTNESS][~hit] == 0).all()
+
+
+@pytest.mark.parametrize("have_brightness", [True, False])
+def test_a_tiled_map_shows_brightness_only_if_all_tiles_have_it(bright_map, measured, candidate, have_brightness):
+    """Brightness must not depend on the tile: queries in a map without it somewhere use none anywhere."""
+    tiles = SurfelTiles(
+        lambda xy_m: [(0,)] * len(xy_m), lambda _: bright_map, np.zeros(3), have_brightness, lambda: [0]
+    )
+    verifier = Listening(0.0)
+    scorer_of(tiles, measured, verifier=verifier).at(candidate(xyz=(0.0, 0.0, 1.5)).registered)
+    (comparison,) = verifier.asked
+    assert (comparison[MAPPED] == 1).any()
+    assert (comparison[MAPPED_BRIGHTNESS] != 0).any() == have_brightness
