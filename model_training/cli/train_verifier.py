@@ -28,8 +28,8 @@ def command(
     """Train the verifier: the network that says from a comparison of image and map whether a pose is right.
 
     A city takes about four minutes on one core. After Ctrl-C the same command goes on with the next city. The training
-    itself starts again. The service uses the file `service/scoring/verifier.onnx`. After a change of this file, fit the
-    calibration again (`streetfix calibrate`).
+    itself starts again. It holds all examples in memory, up to 0.1 GB for each city. The service uses the file
+    `service/scoring/verifier.onnx`. After a change of this file, fit the calibration again (`streetfix calibrate`).
 
     \b
     Example:

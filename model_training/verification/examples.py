@@ -6,10 +6,12 @@ a city: there every answer is wrong. Further poses start up to 8 m beside an ans
 near the right one.
 """
 
+import re
 import shutil
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float32, Int8, UInt8
@@ -22,6 +24,7 @@ from model_training.mapping.build import build_map
 from model_training.mapping.settings import BuildSettings
 from model_training.simulation.simulate import simulate
 from model_training.verification.even_odds import EvenOdds
+from model_training.verification.made_with import REMEDY, MadeWith
 from model_training.verification.plans import verification_plan
 from service.errors import DatasetError, NoDepthError
 from service.geometry.rigid import heading_of_camera
@@ -43,6 +46,8 @@ _CANDIDATES, _BESIDE = 2, 2
 _BESIDE_M, _ALONG = (1.2, 8.0), 0.75
 #: Query sets of the city before that are asked in the map of a city.
 _FOREIGN_SETS = 2
+#: Name of the folder with the cities and maps of unfinished examples: this word and what they are made with (``MadeWith.key``).
+_UNFINISHED, _ANY_UNFINISHED = "unfinished", re.compile(r"unfinished-[0-9a-f]{12}-[0-9a-f]{16}")
 #: Planes are stored with this many steps to each side of 0.
 STEPS = 127
 
@@ -61,14 +66,16 @@ class Examples:
     error_m: Float32[NDArray[np.float32], " n"]
     origin: UInt8[NDArray[np.uint8], " n"]
 
-    def write(self, path: Path) -> None:
+    def write(self, path: Path, made_with: MadeWith) -> None:
         """Write the examples atomically.
 
         Args:
             path: NPZ file.
+            made_with: what the examples depend on.
         """
         part = path.with_suffix(".part.npz")
-        np.savez_compressed(part, planes=self.planes, error_m=self.error_m, origin=self.origin)
+        arrays: dict[str, Any] = {"planes": self.planes, "error_m": self.error_m, "origin": self.origin}
+        np.savez_compressed(part, **arrays | made_with.arrays())
         part.rename(path)
 
     @staticmethod
@@ -86,13 +93,14 @@ class Examples:
             with path.open("rb") as file, np.load(file, allow_pickle=False) as arrays:
                 return Examples(arrays["planes"], arrays["error_m"], arrays["origin"])
 
-        return read_arrays(path, content, remedy="remove it, and the command makes it again")
+        return read_arrays(path, content, remedy=REMEDY)
 
 
 def make_examples(work: Path, encoder: Path, cities: int, *, report: Report = lambda *_: None) -> Iterator[Path]:
     """Simulate cities, build their maps, localize the queries, and store what was compared; yield one file for each city.
 
-    A finished file is not made again. Cities and maps are removed after their last use: a city takes half a gigabyte.
+    A finished file is not made again. Cities and maps are removed after their last use: a city takes half a gigabyte. What an interrupted
+    run has left is used or removed.
 
     Args:
         work: folder of the examples.
@@ -102,33 +110,76 @@ def make_examples(work: Path, encoder: Path, cities: int, *, report: Report = la
 
     Raises:
         EncoderError: the encoder cannot be used.
+        DatasetError: the folder has damaged examples, or those of another encoder or of another version of the code.
     """
+    made_with = MadeWith.of(encoder)  # refuses a bad encoder before the work
     work.mkdir(parents=True, exist_ok=True)
     files = [work / f"examples-{k}.npz" for k in range(cities)]
+    _require_made_with(made_with, work, [file for file in files if file.exists()])
+    unfinished = work / f"{_UNFINISHED}-{made_with.key}"
+    _clean(work, unfinished, files)
     before: Dataset | None = None
     for k, file in enumerate(files):
-        if file.exists() and (k + 1 == cities or files[k + 1].exists()):
-            _removed(before)  # neither this city nor the next one needs its images
+        if not _needs_city(files, k):
+            _removed(before)
             before = None
             yield file
             continue
-        city = _city(work, k, report)
+        city = _city(unfinished, k, report)
         if city is None:
-            _joined([]).write(file)
+            _joined([]).write(file, made_with)
         elif not file.exists():
-            folder = work / f"map-{k}"
+            folder = _map_folder(unfinished, k)
             if not folder.exists():
                 build_map(city, encoder, folder, BuildSettings(name=folder.name, calibration=None), report=report)
             localizer = Localizer.open(MapBundle.open(folder), verifier=EvenOdds())
             found = [*_examples(localizer, city, True, report)]
             if before is not None:
                 found += _examples(localizer, before, False, report)
-            _joined(found).write(file)
+            _joined(found).write(file, made_with)
             shutil.rmtree(folder)
         _removed(before)
         before = city
         yield file
     _removed(before)
+    _clean(work, unfinished, files)
+
+
+def _require_made_with(made_with: MadeWith, work: Path, files: list[Path]) -> None:
+    """Refuse finished files that other code or another encoder has made. A training would mix them with new ones."""
+    others = {file.name: found for file in files if (found := MadeWith.read(file)) != made_with}
+    if others:
+        name, found = next(iter(others.items()))
+        raise DatasetError(
+            f"{work}: {len(others)} of {len(files)} files of examples cannot be used ({name} comes from {made_with.difference_to(found)}); "
+            "choose another --work, or remove these files",
+            field="work",
+        )
+
+
+def _needs_city(files: list[Path], index: int) -> bool:
+    """Return whether the images of a city are needed: for its own examples, or for those on the map of the next city."""
+    return not all(file.exists() for file in files[index : index + 2])
+
+
+def _clean(work: Path, unfinished: Path, files: list[Path]) -> None:
+    """Remove the cities and maps of other code or of another encoder, and those that no unfinished example needs."""
+    for folder in list(work.iterdir()):
+        if folder != unfinished and _ANY_UNFINISHED.fullmatch(folder.name):
+            shutil.rmtree(folder)
+    for k, file in enumerate(files):
+        for folder, needed in (
+            (_map_folder(unfinished, k), not file.exists()),
+            (unfinished / verification_plan(k).name, _needs_city(files, k)),
+        ):
+            if folder.exists() and not needed:
+                shutil.rmtree(folder)
+    if unfinished.exists() and not any(unfinished.iterdir()):
+        unfinished.rmdir()
+
+
+def _map_folder(unfinished: Path, index: int) -> Path:
+    return unfinished / f"map-{index}"
 
 
 def _removed(city: Dataset | None) -> None:
@@ -136,10 +187,10 @@ def _removed(city: Dataset | None) -> None:
         shutil.rmtree(city.folder)
 
 
-def _city(work: Path, index: int, report: Report) -> Dataset | None:
+def _city(unfinished: Path, index: int, report: Report) -> Dataset | None:
     """Simulate a city, or return None if its streets have no room for the queries."""
     plan = verification_plan(index)
-    folder = work / plan.name
+    folder = unfinished / plan.name
     try:
         simulate(plan, folder, report=report)
     except DatasetError as error:

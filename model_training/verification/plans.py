@@ -21,16 +21,19 @@ from model_training.simulation.sensor_parameters import (
 from model_training.training.random_rigs import RECTIFICATION_DEG
 from model_training.training.recipe import TRAINING_SEEDS
 
-#: Index of the seed of the first city in ``TRAINING_SEEDS``. The trainings of the encoder do not use these seeds.
+#: Index of the seed of the first city in ``TRAINING_SEEDS``. The stock encoder was not trained on the seeds from it on (1208 to 1299).
 FIRST_SEED = 208
-#: Largest number of cities. Other seeds follow.
+#: Largest number of cities. The seeds after theirs are those of cities of the encoder.
 MOST_CITIES = 92
 #: Traversals of a city, and queries of each.
 TRAVERSALS, QUERIES = 4, 40
 _STREAM = 4242  # stream of the random generator
+#: Position of the first city in the lists of presets below.
+_FIRST_NUMBER = 8
+#: Presets of the LiDAR, and kinds of depth. One that is listed twice occurs twice as often.
 _LIDARS = (
-    *("hdl_64", "vlp_16", "hdl_32", "os1_64", "pandar_64", "os1_128", "livox_mid_360", "hdl_64", "vlp_16", "paper_32"),
-)
+    "hdl_64", "vlp_16", "hdl_32", "os1_64", "pandar_64", "os1_128", "livox_mid_360", "hdl_64", "vlp_16", "paper_32",
+)  # fmt: skip
 _DEPTHS = ("sgbm", "precise", "bm", "stereo", "sgbm3way", "sgbm", "precise", "sgbm3way", "monocular", "sgbm")
 _KINDS = ("mixed", "city", "mixed")
 _FIELD_DEG = (50.0, 112.0)
@@ -47,11 +50,11 @@ def verification_plan(index: int) -> SimulationPlan:
         index: number of the city, from 0.
 
     Raises:
-        ValueError: the seed of the city belongs to another use.
+        ValueError: there is no city of this number.
     """
     if not 0 <= index < MOST_CITIES:
         raise ValueError(f"index: {index} is not between 0 and {MOST_CITIES - 1}")
-    seed, number = TRAINING_SEEDS[FIRST_SEED + index], index + FIRST_SEED % 200
+    seed, number = TRAINING_SEEDS[FIRST_SEED + index], _FIRST_NUMBER + index
     rng = np.random.default_rng([_STREAM, seed])
     depth = _DEPTHS[number % len(_DEPTHS)]
     field_deg = float(rng.uniform(*_FIELD_DEG))
@@ -75,6 +78,7 @@ def verification_plan(index: int) -> SimulationPlan:
         city=_KINDS[number % len(_KINDS)],
         seed=seed,
         size_m=(180.0, 220.0),
+        # Ten cities have all LiDARs, and the next ten have each LiDAR with another kind of depth.
         lidar=_LIDARS[(7 * number + number // len(_LIDARS)) % len(_LIDARS)],
         lidar_height_m=lidar_height_m,
         spacing_m=spacing_m,
@@ -106,7 +110,7 @@ _Sensor = tuple[StereoParameters, DepthParameters, str | None]
 
 
 def _matched(rng: np.random.Generator, camera: CameraPlan) -> _Sensor:
-    """Draw a stereo rig whose pairs are rendered and matched: from a baseline of 0.05 m to one of 0.6 m."""
+    """Draw a stereo rig whose pairs are rendered and matched. An image of 640 pixels and 90 degrees has a baseline of 0.09 to 0.72 m."""
     field_deg, width = camera.horizontal_deg, camera.width
     focal_baseline_px_m = _log_uniform(rng, 28, 230) * (width / 640) * (90 / field_deg) ** 0.5
     offset, vertical, roll = (share * (width / field_deg) * rng.uniform(0.6, 1.2) for share in RECTIFICATION_DEG)
@@ -118,7 +122,7 @@ def _matched(rng: np.random.Generator, camera: CameraPlan) -> _Sensor:
 
 
 def _precise(rng: np.random.Generator, _camera: CameraPlan) -> _Sensor:
-    """Draw a depth camera with little noise. Half of them and more see a few metres only."""
+    """Draw a depth camera with little noise. Six of ten have a range of 7 to 30 m, and the others have no limit."""
     own = {
         "focal_baseline_px_m": _log_uniform(rng, 20, 250),
         "noise_px": float(rng.uniform(0.05, 0.2)),

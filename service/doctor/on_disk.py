@@ -33,6 +33,8 @@ def check_bundle(path: Path) -> tuple[Finding, Map | None]:
 def check_encoder(bundle: Map) -> tuple[Finding, Localizer | None]:
     """Check that the encoder of a map runs, and that it belongs to the map's descriptors.
 
+    A verifier that cannot be used is a finding of its own: it belongs to the program, not to the map.
+
     Args:
         bundle: the map.
 
@@ -42,7 +44,7 @@ def check_encoder(bundle: Map) -> tuple[Finding, Localizer | None]:
     try:
         localizer = Localizer.open(bundle)
     except StreetfixError as error:
-        return Finding.of_error("encoder", error), None
+        return Finding.of_error("verifier" if error.field == "verifier" else "encoder", error), None
     encoder = localizer.encoder
     text = f"reads views of {encoder.rows} x {encoder.columns} cells and returns descriptors of {encoder.dimension} numbers"
     return Finding("encoder", "ok", text), localizer

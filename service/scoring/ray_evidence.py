@@ -1,4 +1,4 @@
-"""Compare the final pose with the map along the rays of the depth image, and leave out what a moved vehicle explains.
+"""Compare registered poses with the map along the rays of the depth image, and leave out what a moved vehicle explains.
 
 A parked vehicle may have left since the survey, or a new one may stand there. Then much of the image differs from the map at a right pose.
 The height tells such a difference from a wrong pose: a vehicle or a person is at most ``MOVABLE_M`` high. A house, a tree or a pole is
@@ -31,7 +31,9 @@ EDGE_M, EDGE_SHARE = 1.0, 0.05
 
 @dataclass(frozen=True, slots=True)
 class RayEvidence:
-    """Numbers of the final pose that only the confidence uses; means over the frames.
+    """Numbers of a pose that was adjusted along the rays; means over the frames.
+
+    The confidence uses those of the final pose. The support of a candidate contains two of them, with the weights of ``RayWeights``.
 
     Few pixels or edges make a weak share: ``HALF_PIXELS`` of them count half (``static_inliers`` then tends to 0.5, the others to 0).
 

@@ -3,6 +3,7 @@ import pytest
 from service.doctor import on_disk
 from service.maps.reader import MapBundle
 from service.maps.writer import write_bundle
+from service.scoring.verifier import Verifier
 
 
 def test_a_valid_bundle_opens_and_its_parts_are_listed(bundle_path):
@@ -47,7 +48,18 @@ def test_an_encoder_that_does_not_run_is_a_problem(content_of, tmp_path):
     write_bundle(tmp_path / "own", content_of(encoder=b"no network"))
     told, localizer = on_disk.check_encoder(MapBundle.open(tmp_path / "own"))
     assert (told.level, localizer) == ("problem", None)
+    assert told.check == "encoder"
     assert told.text.startswith("ONNX Runtime cannot load the encoder")
+
+
+def test_a_damaged_verifier_is_a_problem_of_the_installation(bundle_path, tmp_path, monkeypatch):
+    damaged = tmp_path / "verifier.onnx"
+    damaged.write_bytes(b"no network")
+    monkeypatch.setattr(Verifier, "shipped", lambda: Verifier.open(damaged, remedy="install Streetfix again"))
+    told, localizer = on_disk.check_encoder(MapBundle.open(bundle_path))
+    assert (told.check, told.level, localizer) == ("verifier", "problem", None)
+    assert told.text.startswith(f"{damaged}: ONNX Runtime cannot load the verifier")
+    assert told.remedy == "install Streetfix again"
 
 
 @pytest.mark.parametrize(("rate", "level"), [(0.001, "ok"), (0.0005, "problem")])

@@ -322,7 +322,7 @@ def test_the_verifier_sees_every_frame_in_its_own_cells_and_their_mean_counts(st
     for comparison in verifier.asked:  # both frames measure the map as it is from their own positions
         both = (comparison[PLANES.index("measured")] > 0) & (comparison[MAPPED] > 0)
         assert both.sum() > 1000
-        assert np.median(np.abs(comparison[PLANES.index("difference_ratio")][both])) < 0.02
+        assert (np.abs(comparison[PLANES.index("difference_ratio")][both]) > 0.1).mean() < 0.05
 
 
 @pytest.mark.parametrize("odds", [-2.0, 0.0, 5.0])

@@ -4,6 +4,7 @@ import pytest
 torch = pytest.importorskip("torch")
 
 from model_training.verification.examples import ANSWER, BESIDE, STEPS, Examples  # noqa: E402
+from model_training.verification.made_with import MadeWith  # noqa: E402
 from model_training.verification.net import VerifierNet  # noqa: E402
 from model_training.verification.train import VerifierTraining, export_verifier, train_verifier  # noqa: E402
 from service.errors import DatasetError, EncoderError  # noqa: E402
@@ -88,7 +89,9 @@ def test_a_network_that_cannot_be_opened_is_not_written(tmp_path, monkeypatch):
 
 
 def test_examples_survive_a_file(tmp_path):
-    city(3).write(tmp_path / "examples.npz")
+    made_with = MadeWith("ab" * 32, "cd" * 8, PLANES)
+    city(3).write(tmp_path / "examples.npz", made_with)
+    assert MadeWith.read(tmp_path / "examples.npz") == made_with
     found = Examples.read(tmp_path / "examples.npz")
     for name in Examples.__dataclass_fields__:
         np.testing.assert_array_equal(getattr(found, name), getattr(city(3), name))
