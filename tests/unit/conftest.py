@@ -98,7 +98,7 @@ def calibration_document(**changed: Any) -> dict[str, Any]:
         "features": [{"name": name, "mean": 0.0, "std": 1.0} for name in FEATURES],
         "right": flat | {"bias": 0.0},
         "known": flat | {"bias": float(np.log(3.0))},
-        "thresholds": [{"false_accept_rate": 0.001, "confidence": 0.9}, {"false_accept_rate": 0.01, "confidence": 0.6}],
+        "thresholds": [{"false_accept_rate": 0.001, "confidence": 0.9}, {"false_accept_rate": 0.01, "confidence": 0.5}],
         "site": None,
         "rig": None,
         "measured_on": {"cities": "none", "queries": 0},

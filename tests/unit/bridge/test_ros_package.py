@@ -146,7 +146,8 @@ def test_the_node_answers_images_until_a_signal(
 ) -> None:
     opened, asked = list[Path](), list[Known]()
 
-    def of(bundle: Path) -> Callable[..., LocalizeAnswer]:
+    def of(bundle: Path, rate: float | None) -> Callable[..., LocalizeAnswer]:
+        assert rate is None
         opened.append(bundle)
 
         def answer(*given: Any) -> LocalizeAnswer:

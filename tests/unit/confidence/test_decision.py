@@ -36,14 +36,14 @@ def decided(calibration_json, calibration_of):
 @pytest.mark.parametrize(
     ("right", "known", "rate", "status"),
     [
-        (0.61, 0.9, 0.01, "LOCALIZED"),  # the threshold for one false accept in a hundred is 0.6
-        (0.59, 0.9, 0.01, "AMBIGUOUS"),
-        (0.59, 0.1, 0.01, "OUT_OF_MAP"),
-        (0.61, 0.1, 0.01, "LOCALIZED"),  # who is sure of the pose need not ask whether it is in the map
+        (0.51, 0.9, 0.01, "LOCALIZED"),  # the threshold for one false accept in a hundred is 0.5
+        (0.49, 0.9, 0.01, "AMBIGUOUS"),
+        (0.49, 0.1, 0.01, "OUT_OF_MAP"),
+        (0.51, 0.1, 0.01, "LOCALIZED"),  # who is sure of the pose need not ask whether it is in the map
         (0.89, 0.9, 0.001, "AMBIGUOUS"),  # and for one in a thousand 0.9
         (0.91, 0.9, 0.001, "LOCALIZED"),
-        (0.59, 0.51, 0.01, "AMBIGUOUS"),
-        (0.59, 0.49, 0.01, "OUT_OF_MAP"),
+        (0.49, 0.51, 0.01, "AMBIGUOUS"),
+        (0.49, 0.49, 0.01, "OUT_OF_MAP"),
     ],
 )
 def test_the_status_follows_from_the_confidence_and_whether_the_place_is_in_the_map(
@@ -194,7 +194,7 @@ def test_without_thresholds_of_its_own_a_rig_has_those_of_the_map(calibration_of
 
 
 def test_a_status_follows_from_the_threshold_of_the_rig(calibration_of, query):
-    """Log odds of 2 become 1, a confidence of 0.731. At a rate of 5 % the map accepts 0.6, and the recording 0.7."""
+    """Log odds of 2 become 1, a confidence of 0.731. At a rate of 5 % the map accepts 0.5, and the recording 0.7."""
     in_range = {"right": {"terms": [], "bias": 2.0}}
     for threshold, status in ((0.7, "LOCALIZED"), (0.75, "AMBIGUOUS")):
         rig = RIG | {"thresholds": [{"false_accept_rate": 0.05, "confidence": threshold}]}

@@ -222,7 +222,7 @@ def test_a_calibrated_map_says_how_sure_it_is_and_accepts_by_the_rate_asked_for(
     rate: float,
     status: str,
 ) -> None:
-    """All queries get 0.5: above the threshold 0.4 for a rate of 1 %, below 0.9 for 0.1 %."""
+    """All queries get 0.5: the threshold for a rate of 1 %, and below the 0.9 for 0.1 %."""
     write_bundle(tmp_path / "m", content_of(calibration=calibration_json()))
     localizer = Localizer.open(MapBundle.open(tmp_path / "m"))
     answer = localizer.localize(replace(query, false_accept_rate=rate))
