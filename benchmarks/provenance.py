@@ -183,6 +183,11 @@ CITY_ARCHIVES = (
     "model_training/training/city_task.py",
     "model_training/training/unpacked_cities.py",
 )
+#: The reader of bags.
+BAG_READERS = tuple(
+    f"model_training/importing/ros_{name}.py"
+    for name in ("bag", "cloud", "content", "frames", "pairs", "picture", "reader", "stereo", "topics")
+)
 #: Files in the folders above that no row of a report runs: tiled maps, object storage, Qdrant, commands for finished maps, the
 #: comparison of stages, and training cities as files. A test checks that the benchmark loads none of them.
 NOT_RUN: dict[str, tuple[str, ...]] = {
@@ -216,6 +221,7 @@ ONLY_RUN_BY: dict[str, dict[str, tuple[str, ...]]] = {
         STAGES: tuple(f"real.kitti_{drive}.{row}" for drive in ("0005", "0013") for row in ("inliers", "retrieval_at")),
         "service/localization/tracker.py": ("real.track.", "ros2."),
         "service/maps/inverted_file.py": (),
+        **dict.fromkeys(BAG_READERS, ("roundtrip.mcap.", "roundtrip.bag.", "import.")),
         **dict.fromkeys(TILED_AND_STORED, ("resume.", "ros2.")),  # these rows start commands in processes of their own
     },
     # The maps of this report are folders. Only a map in object storage is fetched.

@@ -69,7 +69,8 @@ def command(
     topic: Annotated[
         list[str] | None,
         typer.Option(
-            help=f"Topic of a bag, ROLE=NAME. Roles: {', '.join(ROLES)}. Repeat for several.  [default: guessed, except right_info]"
+            help=f"Topic of a bag, ROLE=NAME. Roles: {', '.join(ROLES)}. Repeat for several.  [default: guessed; right_info only with "
+            "--depth sgbm]"
         ),
     ] = None,
     extrinsics: Annotated[
@@ -87,7 +88,8 @@ def command(
         float | None,
         typer.Option(
             help="Baseline of the stereo rig that measured the recorded depth, metres: the distance of its cameras. rosbag takes it from "
-            "--topic right_info=NAME too, the CameraInfo of the rectified right camera. `evaluate` and `calibrate` then send the baseline.",
+            "--topic right_info=NAME too, the CameraInfo of the rectified right camera. --depth sgbm of a rosbag uses it for matching. "
+            "`evaluate` and `calibrate` then send the baseline.",
             min=LEAST_BASELINE_M,
             max=MOST_BASELINE_M,
         ),
@@ -157,6 +159,7 @@ def command(
       streetfix import kitti-raw 2011_09_26_drive_0005_sync --depth sgbm --out data/drive
       streetfix import rosbag drive.mcap --topic scan=/ouster/points --out data/drive
       streetfix import rosbag drive.mcap --topic right_info=/stereo/right/camera_info --out data/drive
+      streetfix import rosbag stereo.mcap --depth sgbm --out data/drive
       streetfix import clouds scans/ --odometry --out data/site
       streetfix import rosbag drive.mcap --georeference 48.98,8.44,110,90 --out data/town
       streetfix import kitti-object KITTI --depth sgbm --out data/kitti

@@ -105,7 +105,22 @@ def _refuse_what_does_not_apply(kind: str, settings: OpenSettings) -> None:
     for field_name, option in _OPTIONS.items():
         if option not in known.takes and getattr(settings, field_name) != getattr(unasked, field_name):
             raise DatasetError(f"{option}: {kind} does not support this option; omit it", field=option)
+    _refuse_topics_of_other_depth(settings)
     _refuse_baseline_without_its_depth(settings)
+
+
+def _refuse_topics_of_other_depth(settings: OpenSettings) -> None:
+    """Refuse right images that are not matched, and depth that matching replaces."""
+    if "right" in settings.topics and settings.depth != "sgbm":
+        raise DatasetError(
+            "topic right: only --depth sgbm matches left and right images; give --depth sgbm too, or omit the topic",
+            field="topic",
+        )
+    if "depth" in settings.topics and settings.depth == "sgbm":
+        raise DatasetError(
+            "topic depth: --depth sgbm computes the depth from left and right images; omit one of the two",
+            field="topic",
+        )
 
 
 def _refuse_baseline_without_its_depth(settings: OpenSettings) -> None:
@@ -181,6 +196,7 @@ def _rosbag(source: Path, settings: OpenSettings) -> Recording:
         rectified=settings.rectified,
         want_pictures=settings.pictures,
         want_depth=settings.depth == "recorded",
+        stereo=settings.depth == "sgbm" and settings.pictures,
         baseline_m=settings.baseline_m,
     )
     return RosBag(source, bag)
@@ -210,7 +226,7 @@ KINDS: dict[str, Kind] = {
     "kitti-360": Kind(_kitti_360, ("recorded", "sgbm", "lidar"), _FILMED | {"depth", "deskew"}),
     "rosbag": Kind(
         _rosbag,
-        ("recorded", "lidar"),
+        ("recorded", "sgbm", "lidar"),
         _FILMED | {"depth", "deskew", "topic", "extrinsics", "camera", "rectified", "baseline-m"},
     ),
     "carla": Kind(_carla, ("recorded", "lidar"), _FILMED | {"depth"}),

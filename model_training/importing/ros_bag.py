@@ -1,8 +1,11 @@
 """Read ROS 1 bags and ROS 2 bags (SQLite and MCAP) as a recording, without ROS."""
 
 from collections.abc import Iterator
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from model_training.datasets.dataset import LidarSensor
 from model_training.importing.recording import (
@@ -19,11 +22,14 @@ from model_training.importing.ros_content import BagSettings, content_of
 from model_training.importing.ros_frames import stamp_of
 from model_training.importing.ros_pairs import Pair, Pairing, UnpairedImage
 from model_training.importing.ros_picture import colour_of, depth_of
-from model_training.importing.ros_reader import Damage, opened
+from model_training.importing.ros_reader import BagReader, Damage, opened
+from model_training.importing.ros_stereo import STEREO_TOLERANCE_S, StereoRig, spread_pairs
 from model_training.importing.ros_topics import ROLES
+from model_training.importing.stereo import RECORDED
 from model_training.importing.trajectory import Trajectory
 
 _WITHOUT_DEPTH = f"no depth within {PAIR_TOLERANCE_S:g} s of it"
+_WITHOUT_RIGHT = f"no right image within {STEREO_TOLERANCE_S:g} s of it"
 
 
 class RosBag:
@@ -48,6 +54,7 @@ class RosBag:
         self._path, self._settings = path, settings
         with opened(path) as bag:
             self._content = content_of(bag, settings)
+            self._rig = self._aligned(bag)
         mounted = self._content.T_vehicle_lidar.tolist()
         self.lidar = LidarSensor(name=self._content.scan_frame or "lidar", T_vehicle_sensor=mounted)
 
@@ -56,19 +63,24 @@ class RosBag:
         """Topics, and the frame of the poses."""
         topics = self._content.topics
         names = {role: None if (topic := getattr(topics, role)) is None else topic.name for role in ROLES}
-        lines = (*topics.lines(), *self._content.remarks)
+        lines = [*topics.lines(), *self._content.remarks]
         lacking = self._settings.want_depth and topics.color is not None and topics.depth is None
         hint = (
-            "no depth topic, so no image becomes a query: give --depth lidar (depth from the scans), --topic "
-            "depth=NAME, or --no-pictures"
+            "no depth topic, so no image becomes a query: give --depth lidar (depth from the scans), --depth sgbm (depth from a stereo "
+            "pair), --topic depth=NAME, or --no-pictures"
         )
-        source = {"path": self._path.name, "topics": names, "vehicle": self._content.vehicle}
+        source: dict[str, Any] = {"path": self._path.name, "topics": names, "vehicle": self._content.vehicle}
+        if self._rig is not None:
+            source |= {"depth": "sgbm", "matching": RECORDED.description()}
+            lines.append(_line_of(self._rig))
+            if self._rig.rows is not None:
+                source["row_alignment"] = asdict(self._rig.rows)
         if lacking:
-            return Notes(lines, source, (hint,))
+            return Notes(tuple(lines), source, (hint,))
         has_depth = self._settings.want_depth and topics.color is not None
         unknown = has_depth and self._content.baseline_m is None
         or_topic = ", or its right CameraInfo with --topic right_info=NAME"
-        return Notes(lines, source, (BASELINE_HINT.format(or_topic),) if unknown else ())
+        return Notes(tuple(lines), source, (BASELINE_HINT.format(or_topic),) if unknown else ())
 
     @property
     def has_images(self) -> bool:
@@ -91,7 +103,7 @@ class RosBag:
             pictures: yield images too.
         """
         roles = self._roles(pictures and self._content.camera is not None)
-        pairing = Pairing(PAIR_TOLERANCE_S)
+        pairing = Pairing(PAIR_TOLERANCE_S if self._rig is None else STEREO_TOLERANCE_S)
         with opened(self._path) as bag:
             for found in bag.messages(roles):
                 if isinstance(found, Damage):
@@ -101,7 +113,7 @@ class RosBag:
                 role, stamp_s = roles[found.topic], stamp_of(found.content.header)
                 if role == "scan":
                     yield self._scan(found.content, stamp_s)
-                elif role == "color" and "depth" not in roles.values():
+                elif role == "color" and "partner" not in roles.values():
                     yield self._picture(Pair(stamp_s, found.content, None))
                 else:
                     yield from map(self._paired, pairing.add(role, stamp_s, found.content))
@@ -112,8 +124,10 @@ class RosBag:
         roles = {topics.scan.name: "scan"}
         if pictures and topics.color is not None:
             roles[topics.color.name] = "color"
-            if self._settings.want_depth and topics.depth is not None:
-                roles[topics.depth.name] = "depth"
+            if self._rig is not None and topics.right is not None:
+                roles[topics.right.name] = "partner"
+            elif self._settings.want_depth and topics.depth is not None:
+                roles[topics.depth.name] = "partner"
         return roles
 
     def _scan(self, message: Any, stamp_s: float) -> Event:
@@ -123,8 +137,35 @@ class RosBag:
 
     def _paired(self, found: Pair | UnpairedImage) -> Event:
         if isinstance(found, Pair):
-            return self._picture(found)
-        return Unusable("image", f"{found.role} at {found.stamp_s:.6f}", _WITHOUT_DEPTH)
+            return self._picture(found) if self._rig is None else self._matched(found, self._rig)
+        why = _WITHOUT_DEPTH if self._rig is None else _WITHOUT_RIGHT
+        return Unusable("image", f"{found.role} at {found.stamp_s:.6f}", why)
+
+    def _aligned(self, bag: BagReader) -> StereoRig | None:
+        """The stereo rig with the alignment of its rows, if pairs are matched."""
+        rig, topics = self._content.rig, self._content.topics
+        if rig is None or topics.color is None or topics.right is None:
+            return None
+        return rig.with_aligned_rows(spread_pairs(bag, topics.color.name, topics.right.name))
+
+    def _matched(self, pair: Pair, rig: StereoRig) -> Event:
+        camera, topic = self._content.camera, self._content.topics.color
+        assert camera is not None  # noqa: S101  # a rig has a camera
+        assert topic is not None  # noqa: S101
+        name = f"{topic.name} at {pair.stamp_s:.6f}"
+        images = rig.rectified(pair)
+        if isinstance(images, str):
+            return Unusable("image", name, images)
+        depth = rig.depth(*images)
+        return RecordedPicture(
+            name,
+            pair.stamp_s,
+            images[0],
+            rig.camera,
+            camera.T_vehicle_camera,
+            depth=depth,
+            baseline_m=rig.baseline_m,
+        )
 
     def _picture(self, pair: Pair) -> Event:
         camera, topic = self._content.camera, self._content.topics.color
@@ -132,7 +173,7 @@ class RosBag:
         assert topic is not None  # noqa: S101
         name = f"{topic.name} at {pair.stamp_s:.6f}"
         rgb = colour_of(pair.color)
-        depth = None if pair.depth is None else depth_of(pair.depth)
+        depth = None if pair.partner is None else depth_of(pair.partner)
         if isinstance(rgb, str):
             return Unusable("image", name, rgb)
         if isinstance(depth, str):
@@ -150,3 +191,14 @@ class RosBag:
             depth=depth,
             baseline_m=None if depth is None else self._content.baseline_m,
         )
+
+
+def _line_of(rig: StereoRig) -> str:
+    """How pairs are matched, for people."""
+    of = "rectified" if rig.lookups is None else "raw images, rectified by their calibrations"
+    rows = (
+        "rows as recorded (too few matched features)"
+        if rig.rows is None
+        else f"rows aligned by {np.rad2deg(rig.rows.pitch_rad):.3f} degrees of pitch and {np.rad2deg(rig.rows.roll_rad):.3f} of roll"
+    )
+    return f"stereo pairs: {of}, baseline {rig.baseline_m:.4f} m; right camera: {rows}"

@@ -10,7 +10,8 @@ from model_training.importing.extrinsics import Extrinsics
 from model_training.importing.ros_frames import FrameTree, stamp_of, transform_of
 from model_training.importing.ros_picture import baseline_of, camera_of
 from model_training.importing.ros_reader import BagReader, Damage
-from model_training.importing.ros_topics import POSE_TYPES, Topics, topics_of
+from model_training.importing.ros_stereo import StereoRig, lookups_of, require_same_projection
+from model_training.importing.ros_topics import POSE_TYPES, SIDES, Topics, topics_of
 from model_training.importing.trajectory import Trajectory
 from service.bridge.pictures import is_rectified_by_name
 from service.errors import DatasetError, RequestError
@@ -25,13 +26,15 @@ class BagSettings:
     """Settings of the reader of a bag.
 
     Attributes:
-        topics: by role: scan, color, depth, info, right_info, poses.
+        topics: by role: scan, color, depth, right, info, right_info, poses.
         extrinsics: mountings that the bag does not contain.
         camera: intrinsics, if the bag has no CameraInfo.
         rectified: whether the images are rectified already; None decides by the topic's name.
         want_pictures: False needs neither intrinsics nor the camera's mounting.
         want_depth: False pairs no depth with colour.
-        baseline_m: of the stereo rig that measured the depth, metres; None if it is not known or in the topic ``right_info``.
+        stereo: match left and right images. The topic of depth is not used then.
+        baseline_m: of the stereo rig that measured the depth or whose pairs are matched, metres; None if it is not known or in the
+            topic ``right_info``.
         max_points: a larger scan is refused.
     """
 
@@ -41,6 +44,7 @@ class BagSettings:
     rectified: bool | None = None
     want_pictures: bool = True
     want_depth: bool = True
+    stereo: bool = False
     baseline_m: float | None = None
     max_points: int = 5_000_000
 
@@ -70,6 +74,7 @@ class BagContent:
         T_vehicle_lidar: maps points from the scan's frame to the vehicle frame (4, 4).
         camera: None if there are no images, or none are wanted.
         baseline_m: of the stereo rig that measured the depth, metres; None if it is not known.
+        rig: whose pairs are matched; None if none are.
         remarks: what was assumed and left out, one line each.
     """
 
@@ -80,6 +85,7 @@ class BagContent:
     T_vehicle_lidar: Transform
     camera: BagCamera | None
     baseline_m: float | None
+    rig: StereoRig | None
     remarks: tuple[str, ...]
 
 
@@ -94,7 +100,7 @@ def content_of(bag: BagReader, settings: BagSettings) -> BagContent:
         DatasetError: the bag has no scan, a given topic does not fit, intrinsics or a mounting are missing, or the calibration of the
             right camera gives no baseline.
     """
-    topics = topics_of(bag.topics(), settings.topics, source=bag.name)
+    topics = topics_of(bag.topics(), settings.topics, source=bag.name, stereo=settings.stereo)
     scan_frame = bag.first(topics.scan.name).header.frame_id.lstrip("/")
     remarks: list[str] = []
     tree, poses, vehicle = _poses(bag, topics, remarks)
@@ -107,6 +113,12 @@ def content_of(bag: BagReader, settings: BagSettings) -> BagContent:
         T_vehicle_lidar = _mounting(bag.name, tree, vehicle, scan_frame, "T_vehicle_lidar")
     else:
         T_vehicle_lidar = np.eye(4)
+    if settings.stereo and settings.want_pictures and topics.color is None:
+        raise DatasetError(
+            f"{bag.name}: --depth sgbm matches left and right images, and no image topic has a word for the left camera in its name "
+            f"({', '.join(left for left, _ in SIDES)}); give --topic color=LEFT --topic right=RIGHT, or another --depth",
+            field="color",
+        )
     camera = (
         _camera(bag, topics, settings, tree, vehicle, scan_frame, T_vehicle_lidar) if settings.want_pictures else None
     )
@@ -114,7 +126,57 @@ def content_of(bag: BagReader, settings: BagSettings) -> BagContent:
     assumed = "" if vehicle or poses is None else " (assumed: the topic does not say)"
     remarks.insert(0, f"poses are of: {of}{assumed}")
     baseline_m = _baseline(bag, topics, settings)
-    return BagContent(topics, scan_frame, of, poses, T_vehicle_lidar, camera, baseline_m, tuple(remarks))
+    rig = _rig(bag, topics, settings, camera, baseline_m) if settings.stereo and camera is not None else None
+    return BagContent(topics, scan_frame, of, poses, T_vehicle_lidar, camera, baseline_m, rig, tuple(remarks))
+
+
+def _rig(
+    bag: BagReader, topics: Topics, settings: BagSettings, camera: BagCamera, baseline_m: float | None
+) -> StereoRig:
+    """The stereo rig of the left and right images."""
+    assert topics.color is not None  # noqa: S101  # there is a camera only with colour images
+    if topics.right is None:
+        raise DatasetError(
+            f"{bag.name}: --depth sgbm matches left and right images, and no topic of right images fits {topics.color.name}; give "
+            "--topic color=LEFT --topic right=RIGHT, or another --depth",
+            field="right",
+        )
+    if baseline_m is None:
+        raise DatasetError(
+            f"{bag.name}: --depth sgbm needs the distance of the cameras, and no calibration of the right camera was found; give its "
+            "CameraInfo with --topic right_info=NAME, or --baseline-m METRES",
+            field="right_info",
+        )
+    infos = [None if topic is None else bag.first(topic.name) for topic in (topics.info, topics.right_info)]
+    left, right = infos if settings.camera is None else (None, None)
+    if is_rectified(topics, settings):
+        if left is not None and right is not None:
+            require_same_projection(left, right, source=bag.name)
+        if camera.pinhole.distortion:
+            raise DatasetError(
+                f"{bag.name}: the camera of --camera has a lens, and matching needs rectified images; give the camera of the rectified "
+                "images, or record the CameraInfo of both cameras",
+                field="camera",
+            )
+        return StereoRig(camera.pinhole, baseline_m)
+    if left is None or right is None:
+        raise DatasetError(
+            f"{bag.name}: the images of {topics.color.name} are raw, and only the CameraInfo of both cameras says how to rectify them; "
+            "give --topic info=LEFT --topic right_info=RIGHT, or --rectified if they are rectified",
+            field="info",
+        )
+    return StereoRig(camera.pinhole, baseline_m, lookups_of(left, right, source=bag.name))
+
+
+def is_rectified(topics: Topics, settings: BagSettings) -> bool:
+    """Return whether the images of a bag are rectified: as given, or by the name of their topic.
+
+    Args:
+        topics: of the bag, with colour images.
+        settings: of the reader.
+    """
+    assert topics.color is not None  # noqa: S101
+    return is_rectified_by_name(topics.color.name) if settings.rectified is None else settings.rectified
 
 
 def _baseline(bag: BagReader, topics: Topics, settings: BagSettings) -> float | None:
@@ -205,8 +267,8 @@ def _camera(
     else:
         assert topics.info is not None  # noqa: S101  # otherwise the error above was raised
         message = bag.first(topics.info.name)
-        is_rectified = is_rectified_by_name(topics.color.name) if settings.rectified is None else settings.rectified
-        found = camera_of(message, is_rectified=is_rectified)
+        # pairs are rectified before they are matched
+        found = camera_of(message, is_rectified=settings.stereo or is_rectified(topics, settings))
         if isinstance(found, str):
             raise DatasetError(
                 f"{bag.name}, topic {topics.info.name}: {found}; give the camera with --camera FILE", field="info"

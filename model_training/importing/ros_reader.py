@@ -66,16 +66,22 @@ class BagReader:
         topics = self.reader.topics.items()
         return [Topic(name, info.msgtype, info.msgcount) for name, info in topics if info.msgtype is not None]
 
-    def messages(self, topics: Collection[str]) -> Iterator[Message | Damage]:
+    @property
+    def span_ns(self) -> tuple[int, int]:
+        """Times of the first and of the last message, nanoseconds."""
+        return int(self.reader.start_time), int(self.reader.end_time)
+
+    def messages(self, topics: Collection[str], *, from_ns: int | None = None) -> Iterator[Message | Damage]:
         """Yield the messages of some topics in the bag's order, and the damage between them.
 
         Args:
             topics: names of the topics.
+            from_ns: leave out messages that were recorded before this time, nanoseconds; None yields all.
         """
         connections = [c for c in self.reader.connections if c.topic in topics]
         if not connections:
             return
-        raw = self.reader.messages(connections=connections)
+        raw = self.reader.messages(connections=connections, start=from_ns)
         while True:
             # On damaged data the package, its codecs and SQLite raise errors without a common base class.
             try:

@@ -6,9 +6,12 @@ from dataclasses import dataclass
 from service.errors import DatasetError
 
 #: Roles that a topic can have.
-ROLES = ("scan", "color", "depth", "info", "right_info", "poses")
-#: A role that is never guessed: only the user knows whether a stereo rig measured the depth.
-_GIVEN_ONLY = frozenset({"right_info"})
+ROLES = ("scan", "color", "depth", "right", "info", "right_info", "poses")
+#: Roles that are guessed only if the caller wants the pairs of a stereo rig matched. For other depth, only the user knows whether a stereo
+#: rig measured it.
+_OF_STEREO = frozenset({"right", "right_info"})
+#: Words for the left and the right camera in the names of topics. RealSense calls them infra1 and infra2.
+SIDES = (("left", "right"), ("infra1", "infra2"), ("cam0", "cam1"))
 #: Types of messages with poses, the preferred one first.
 POSE_TYPES = (
     "nav_msgs/msg/Odometry",
@@ -21,6 +24,7 @@ _TYPES: dict[str, tuple[str, ...]] = {
     "scan": ("sensor_msgs/msg/PointCloud2",),
     "color": _IMAGE_TYPES,
     "depth": _IMAGE_TYPES,
+    "right": _IMAGE_TYPES,
     "info": ("sensor_msgs/msg/CameraInfo",),
     "right_info": ("sensor_msgs/msg/CameraInfo",),
     "poses": POSE_TYPES,
@@ -48,10 +52,11 @@ class Topics:
 
     Attributes:
         scan: point clouds.
-        color: colour images.
+        color: colour images; those of the left camera if pairs are matched.
         depth: depth images.
+        right: images of the right camera.
         info: intrinsics.
-        right_info: calibration of the right camera of the stereo rig that measured the depth.
+        right_info: calibration of the right camera of the stereo rig that measured the depth, or whose pairs are matched.
         poses: poses.
         guessed: roles whose topic was not given.
     """
@@ -59,16 +64,19 @@ class Topics:
     scan: Topic
     color: Topic | None
     depth: Topic | None
+    right: Topic | None
     info: Topic | None
     right_info: Topic | None
     poses: Topic | None
     guessed: tuple[str, ...]
 
     def lines(self) -> tuple[str, ...]:
-        """Return one line per role. It says whether the topic was guessed."""
+        """Return one line per role. It says whether the topic was guessed. Right images have a line only if they are chosen."""
         lines = []
         for role in ROLES:
             topic: Topic | None = getattr(self, role)
+            if role == "right" and topic is None:  # most bags have no pairs to match
+                continue
             guess = " (guessed)" if role in self.guessed and topic is not None else ""
             what = (
                 "none" if topic is None else f"{topic.name}, {topic.count} x {topic.msgtype.rsplit('/', 1)[-1]}{guess}"
@@ -77,13 +85,14 @@ class Topics:
         return tuple(lines)
 
 
-def topics_of(available: list[Topic], given: Mapping[str, str], *, source: str) -> Topics:
+def topics_of(available: list[Topic], given: Mapping[str, str], *, source: str, stereo: bool = False) -> Topics:
     """Choose the topics of a bag.
 
     Args:
         available: all topics of the bag.
-        given: topics of the caller by role; the others are guessed, except ``right_info``.
+        given: topics of the caller by role; the others are guessed, except ``right`` and ``right_info`` without ``stereo``.
         source: name of the bag, for errors.
+        stereo: the pairs of a stereo rig will be matched. Then no topic of depth is chosen.
 
     Raises:
         DatasetError: a role or topic is unknown or of another type, or there is no point cloud.
@@ -103,8 +112,12 @@ def topics_of(available: list[Topic], given: Mapping[str, str], *, source: str) 
                 field="topic",
             )
     chosen = {role: by_name[name] for role, name in given.items()}
+    unused = frozenset({"depth"}) if stereo else _OF_STEREO
     for role in ROLES:
-        if role not in chosen and role not in _GIVEN_ONLY and (topic := _guess(role, available, chosen)) is not None:
+        if role in chosen or role in unused:
+            continue
+        guess = _guess_of_stereo if stereo and role in ("color", *_OF_STEREO) else _guess
+        if (topic := guess(role, available, chosen)) is not None:
             chosen[role] = topic
     if "scan" not in chosen:
         have = ", ".join(f"{topic.name} ({topic.msgtype})" for topic in available) or "nothing"
@@ -115,6 +128,7 @@ def topics_of(available: list[Topic], given: Mapping[str, str], *, source: str) 
         scan=chosen["scan"],
         color=chosen.get("color"),
         depth=chosen.get("depth"),
+        right=chosen.get("right"),
         info=chosen.get("info"),
         right_info=chosen.get("right_info"),
         poses=chosen.get("poses"),
@@ -142,6 +156,23 @@ def _guess(role: str, available: list[Topic], chosen: Mapping[str, Topic]) -> To
         return (-int(aligned), -_shared(topic.name, near), -topic.count)
 
     return min(fitting, key=rank, default=None)
+
+
+def _guess_of_stereo(role: str, available: list[Topic], chosen: Mapping[str, Topic]) -> Topic | None:
+    """Left images by the word for their side. The topics of the right camera have the other word at the same place."""
+    fitting = [
+        topic for topic in available if topic.msgtype in _TYPES[role] and topic.count and topic not in chosen.values()
+    ]
+    if role == "color":
+        return max((t for t in fitting if _other_side(t.name)), key=lambda t: ("rect" in t.name, t.count), default=None)
+    left = chosen.get("color" if role == "right" else "info")
+    wanted = None if left is None else _other_side(left.name)
+    return next((topic for topic in fitting if topic.name == wanted), None)
+
+
+def _other_side(name: str) -> str | None:
+    """Return the name of the right camera's topic for that of a left one; None if the name has no word for the left side."""
+    return next((name.replace(left, right) for left, right in SIDES if left in name), None)
 
 
 def _shared(one: str, other: str) -> int:

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from benchmarks import provenance
-from benchmarks.provenance import MEASURED, NOT_RUN, ROOT, TILED_AND_STORED, mark_stale, measured_paths
+from benchmarks.provenance import BAG_READERS, MEASURED, NOT_RUN, ROOT, TILED_AND_STORED, mark_stale, measured_paths
 from model_training.calibration.answer_code import code_of_answers
 from service.maps import inverted_file
 
@@ -186,9 +186,14 @@ def loaded():
 def test_a_benchmark_does_not_load_what_it_claims_not_to_run(loaded, report):
     files = loaded[report]
     assert ROOT / "model_training" / "mapping" / "build.py" in files
-    for path in {*NOT_RUN[report], *TILED_AND_STORED}:
+    for path in {*NOT_RUN[report], *TILED_AND_STORED, *(BAG_READERS if report == "real_data" else ())}:
         assert (ROOT / path).exists(), path
         assert not [each for each in files if each.is_relative_to(ROOT / path)], path
+
+
+def test_every_file_of_the_reader_of_bags_counts_for_the_rows_that_import_bags():
+    folder = ROOT / "model_training" / "importing"
+    assert {str(path.relative_to(ROOT)) for path in folder.glob("ros_*.py")} == set(BAG_READERS)
 
 
 def test_the_maps_of_accuracy_rows_have_no_search_index():

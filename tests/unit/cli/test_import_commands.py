@@ -87,7 +87,7 @@ def test_import_without_poses_says_where_they_may_come_from(scans, tmp_path, cap
     [
         ("rosbag", ("--topic", "scan"), "topic: 'scan' is not ROLE=NAME"),
         ("rosbag", ("--sync", "guess"), "sync: 'guess' is not valid; choose interpolate or nearest"),
-        ("rosbag", ("--depth", "sgbm"), "rosbag has no 'sgbm' depth"),
+        ("carla", ("--depth", "sgbm"), "carla has no 'sgbm' depth"),
         ("clouds", ("--hold-out", "1"), "hold_out: 1 would leave no survey"),
         ("rosbag", ("--extrinsics", "nowhere.json"), "nowhere.json: cannot be read as JSON"),
         ("rosbag", ("--camera", "nowhere.json"), "nowhere.json: not a valid camera"),

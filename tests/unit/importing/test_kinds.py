@@ -26,7 +26,7 @@ def test_nothing_at_the_name_is_refused(tmp_path, kind):
     ("kind", "settings", "why"),
     [
         ("clouds", OpenSettings(depth="sgbm"), "clouds has no 'sgbm' depth; choose one of: recorded"),
-        ("rosbag", OpenSettings(depth="stored"), "rosbag has no 'stored' depth; choose one of: recorded, lidar"),
+        ("rosbag", OpenSettings(depth="stored"), "rosbag has no 'stored' depth; choose one of: recorded, sgbm, lidar"),
         ("kitti-raw", OpenSettings(topics={"scan": "/x"}), "topic: kitti-raw does not support this option"),
         (
             "carla",
@@ -54,6 +54,16 @@ def test_nothing_at_the_name_is_refused(tmp_path, kind):
             "rosbag",
             OpenSettings(topics={"right_info": "/r"}, pictures=False),
             "topic right_info: --no-pictures imports no depth, so there is no stereo depth; omit one of the two",
+        ),
+        (
+            "rosbag",
+            OpenSettings(topics={"right": "/r"}),
+            "topic right: only --depth sgbm matches left and right images; give --depth sgbm too",
+        ),
+        (
+            "rosbag",
+            OpenSettings(topics={"depth": "/d"}, depth="sgbm"),
+            "topic depth: --depth sgbm computes the depth from left and right images; omit one of the two",
         ),
     ],
 )

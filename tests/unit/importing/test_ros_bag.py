@@ -85,8 +85,8 @@ def test_a_bag_without_a_topic_of_depth_says_what_serves_its_pictures(ros, drive
     path = ros.write(tmp_path / "bag", drive(without={"/camera/depth/image_raw"}, count=2))
     (line,) = opened(path).notes.picture_lines
     assert line == (
-        "no depth topic, so no image becomes a query: give --depth lidar (depth from the scans), --topic depth=NAME, "
-        "or --no-pictures"
+        "no depth topic, so no image becomes a query: give --depth lidar (depth from the scans), --depth sgbm (depth from a stereo pair), "
+        "--topic depth=NAME, or --no-pictures"
     )
     assert opened(path, want_depth=False).notes.picture_lines == ()
 

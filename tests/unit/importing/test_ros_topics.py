@@ -1,6 +1,6 @@
 import pytest
 
-from model_training.importing.ros_topics import Topic, topics_of
+from model_training.importing.ros_topics import ROLES, Topic, topics_of
 from service.errors import DatasetError
 
 SCAN = Topic("/points", "sensor_msgs/msg/PointCloud2", 10)
@@ -59,6 +59,27 @@ def test_given_values_are_not_guessed_and_lines_list_them():
     topics = topics_of([SCAN, *available], {"color": "/a"}, source="x")
     assert topics.lines()[:2] == ("scan: /points, 10 x PointCloud2 (guessed)", "color: /a, 10 x Image")
     assert topics.lines()[-1] == "poses: none"
+
+
+def test_the_right_topics_of_a_stereo_rig_have_the_names_of_the_left_ones_and_no_depth_is_chosen():
+    available = [
+        image("/mono/image_rect", 99),
+        image("/stereo/left/image_raw"),
+        image("/stereo/left/image_rect/compressed", kind="CompressedImage"),
+        image("/stereo/right/image_raw"),
+        image("/stereo/right/image_rect/compressed", kind="CompressedImage"),
+        image("/stereo/depth"),
+        info("/stereo/right/camera_info"),
+        info("/stereo/left/camera_info"),
+    ]
+    topics = topics_of([SCAN, *available], {}, source="x", stereo=True)
+    found = [getattr(topics, role) and getattr(topics, role).name for role in ROLES]
+    sides = [f"/stereo/{side}/image_rect/compressed" for side in ("left", "right")]
+    assert found == ["/points", sides[0], None, sides[1], "/stereo/left/camera_info", "/stereo/right/camera_info", None]
+    assert f"right: {sides[1]}, 10 x CompressedImage (guessed)" in topics.lines()
+    without = topics_of([SCAN, *available], {}, source="x")
+    assert (without.right, without.right_info) == (None, None)
+    assert not [line for line in without.lines() if line.startswith("right:")]
 
 
 def test_the_right_camera_is_never_guessed_and_is_not_the_left_one_once_given():
