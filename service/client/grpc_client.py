@@ -10,6 +10,7 @@ from typing import Any, Self, TypeVar, Unpack
 import grpc
 
 from service.client import grpc_messages, prepare
+from service.client.cells import HEADER, cell_of
 from service.client.encode import JPEG_QUALITY, Packing
 from service.client.grpc_errors import errors_of_grpc, refused_in_batch
 from service.client.prepare import Camera, Depth, Frame, RequestOptions, Rgb, SequenceOptions
@@ -133,8 +134,10 @@ class GrpcClient:
                 uniformly resized version of this camera's image.
             **about: optional data; see ``RequestOptions``.
         """
-        message = grpc_messages.request_message(prepare.one(rgb, depth, camera, about, self._packing))
-        return self._call(self._stub.Localize, message, grpc_messages.answer_of)
+        prepared = prepare.one(rgb, depth, camera, about, self._packing)
+        cell = cell_of(prepared.document.prior, prepared.document.map, prepared.before)
+        message = grpc_messages.request_message(prepared)
+        return self._call(self._stub.Localize, message, grpc_messages.answer_of, cell)
 
     def localize_sequence(self, frames: Sequence[Frame], **about: Unpack[SequenceOptions]) -> LocalizeAnswer:
         """Localize the first frame of a sequence, as ``Client.localize_sequence`` does.
@@ -143,8 +146,12 @@ class GrpcClient:
             frames: the first frame is the reference. Each further frame needs ``T_reference_camera``, as from odometry.
             **about: optional data; see ``SequenceOptions``.
         """
-        message = grpc_messages.sequence_message(prepare.sequence(frames, about, self._packing))
-        return self._call(self._stub.LocalizeSequence, message, lambda got: grpc_messages.answer_of(got.answer))
+        prepared = prepare.sequence(frames, about, self._packing)
+        cell, message = (
+            cell_of(prepared.document.prior, prepared.document.map),
+            grpc_messages.sequence_message(prepared),
+        )
+        return self._call(self._stub.LocalizeSequence, message, lambda got: grpc_messages.answer_of(got.answer), cell)
 
     def localize_batch(
         self, frames: Sequence[Frame], **about: Unpack[SequenceOptions]
@@ -155,8 +162,9 @@ class GrpcClient:
             frames: the queries. ``T_reference_camera`` must be None.
             **about: optional data for every query; see ``SequenceOptions``.
         """
-        message = grpc_messages.batch_message(prepare.several(frames, about, self._packing))
-        return self._call(self._stub.LocalizeBatch, message, _outcomes)
+        prepared = prepare.several(frames, about, self._packing)
+        first, message = prepared.document.requests[0], grpc_messages.batch_message(prepared)
+        return self._call(self._stub.LocalizeBatch, message, _outcomes, cell_of(first.prior, first.map))
 
     def maps(self) -> list[MapEntry]:
         """Return all mounted maps, as ``Client.maps`` does."""
@@ -176,12 +184,14 @@ class GrpcClient:
         """Return the area in which the maps can answer, as ``Client.coverage`` does."""
         return self._call(self._stub.GetCoverage, pb.GetCoverageRequest(), lambda got: geojson(got.geojson))
 
-    def _call(self, method: Callable[..., M], message: object, read: Callable[[M], A]) -> A:
+    def _call(self, method: Callable[..., M], message: object, read: Callable[[M], A], cell: str | None = None) -> A:
+        """Call a method until it succeeds or must not be tried again; a proxy may choose the instance by the cell."""
         attempts = Attempts(self._policy, self._clock, self._draw)
+        metadata = self._metadata if cell is None else (*self._metadata, (HEADER.lower(), cell))
         while True:
             try:
                 with errors_of_grpc(self._address, self._timeout_s, self._tls if self._speaks_tls else None):
-                    return read(method(message, timeout=self._timeout_s, metadata=self._metadata))
+                    return read(method(message, timeout=self._timeout_s, metadata=metadata))
             except StreetfixError as error:
                 wait_s = attempts.wait_after(error)
             self._sleep(wait_s)

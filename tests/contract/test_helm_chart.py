@@ -10,6 +10,7 @@ import pytest
 import yaml
 
 from service.client.cells import HEADER
+from service.grpc.generated.streetfix.v1 import localization_pb2
 from service.runtime.settings import Settings
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -100,6 +101,7 @@ STORED = [
         "network.store[0]=10.1.0.0/16",
     ),
 ]
+SERVICE = localization_pb2.DESCRIPTOR.services_by_name["LocalizationService"]
 ROUTING = ["--set", "routing.enabled=true,routing.host=maps.example"]
 
 
@@ -302,15 +304,22 @@ def test_without_routing_nothing_is_routed() -> None:
 @needs_helm
 def test_envoy_gateway_hashes_the_header_of_the_client() -> None:
     found = documents(
-        *(*BASE, *KEYS, *ROUTING, "--set", "routing.gateway.name=eg,routing.gateway.namespace=edge,service.http=8080")
+        *(*BASE, *KEYS, *ROUTING, "--set", "routing.gateway.name=eg,routing.gateway.namespace=edge"),
+        *("--set", "service.http=8080,service.grpc=5005"),
     )
     route, policy, service = (found[kind] for kind in ("HTTPRoute", "BackendTrafficPolicy", "Service"))
     assert route["spec"]["parentRefs"] == [{"name": "eg", "namespace": "edge"}]
     assert route["spec"]["hostnames"] == ["maps.example"]
-    (rule,) = route["spec"]["rules"]
+    rule, of_grpc = route["spec"]["rules"]
     assert rule["backendRefs"] == [{"name": service["metadata"]["name"], "port": 8080}]
     assert 8080 in [each["port"] for each in service["spec"]["ports"]]
     assert float(rule["timeouts"]["request"].removesuffix("s")) > Settings.model_fields["request_timeout_s"].default
+    ports = {each["name"]: each for each in service["spec"]["ports"]}
+    assert of_grpc["backendRefs"] == [{"name": service["metadata"]["name"], "port": 5005}]
+    assert (ports["grpc"]["port"], ports["grpc"]["appProtocol"]) == (5005, "kubernetes.io/h2c")
+    (match,) = of_grpc["matches"]
+    assert match == {"path": {"type": "PathPrefix", "value": f"/{SERVICE.full_name}/"}}
+    assert of_grpc["timeouts"] == {"request": "0s"}  # no timeout: a stream may last for hours
     (target,) = policy["spec"]["targetRefs"]
     assert target == {
         "group": "gateway.networking.k8s.io",

@@ -11,7 +11,7 @@ import pytest
 from google.rpc import code_pb2
 from grpc_status import rpc_status
 
-from service.client import Frame, GrpcClient, Options, PinholeCamera, Prior, PriorPosition
+from service.client import Frame, GrpcClient, Options, PinholeCamera, Prior, PriorPosition, Track
 from service.client.grpc_errors import errors_of_grpc
 from service.client.grpc_messages import answer_of
 from service.client.retry import RetryPolicy
@@ -126,6 +126,7 @@ def test_a_request_is_read_by_the_service_as_written(client: GrpcClient, told: T
     assert read.vehicle_base_on_ground
     assert told.asked[0].depth.startswith(b"SFD1")
     assert told.metadata["authorization"] == "Bearer k"
+    assert told.metadata["x-streetfix-cell"] == "m-map-0-0"
 
 
 @pytest.mark.parametrize(
@@ -331,3 +332,38 @@ def test_an_address_that_is_none_is_refused(address: str) -> None:
 def test_a_time_that_is_none_is_refused(timeout_s: float) -> None:
     with pytest.raises(RequestError, match="timeout_s"):
         GrpcClient("x:1", timeout_s=timeout_s)
+
+
+def test_sequences_and_batches_have_the_cell_of_their_first_prior_and_other_calls_have_none(
+    client: GrpcClient, told: Told, answer_json: Json
+) -> None:
+    answer = answer_message(schema.LocalizeAnswer.model_validate(answer_json()))
+    first = Frame(rgb=RGB, depth=DEPTH, camera=CAMERA)
+    frames = [first, replace(first, T_reference_camera=np.eye(4))]
+    prior = Prior(position=PriorPosition(x=-1.0, y=2500.0, std_m=3.0))
+    told.answers = [
+        pb.LocalizeSequenceResponse(answer=answer),
+        pb.LocalizeBatchResponse(outcomes=[pb.Outcome(answer=answer)]),
+        pb.ListMapsResponse(),
+    ]
+    cells = []
+    for call in (
+        lambda: client.localize_sequence(frames, map="m", prior=prior),
+        lambda: client.localize_batch(frames[:1], map="m", prior=prior),
+        client.maps,
+    ):
+        call()
+        cells.append(told.metadata.get("x-streetfix-cell"))
+    assert cells == ["m-map--1-2", "m-map--1-2", None]
+
+
+def test_a_track_without_a_prior_has_the_cell_of_its_last_answer(
+    client: GrpcClient, told: Told, answer_json: Json
+) -> None:
+    pose = POSE | {"position": {"x": 1200.0, "y": 3.0, "z": 0.0}}
+    modes = [{"pose": pose, "weight": 0.9, "number": 0, "unseen": 0}]
+    belief = {"epoch": 0, "modes": modes, "elsewhere": 0.1, "outside": 0.0, "token": "t"}
+    before = schema.LocalizeAnswer.model_validate(answer_json(pose=pose, belief=belief))
+    told.answers = [answer_message(before)]
+    client.localize(RGB, DEPTH, CAMERA, map="m", track=Track(before=before, T_previous_camera=np.eye(4)))
+    assert told.metadata["x-streetfix-cell"] == "m-map-1-0"
