@@ -183,11 +183,6 @@ CITY_ARCHIVES = (
     "model_training/training/city_task.py",
     "model_training/training/unpacked_cities.py",
 )
-#: The reader of bags.
-BAG_READERS = tuple(
-    f"model_training/importing/ros_{name}.py"
-    for name in ("bag", "cloud", "content", "frames", "pairs", "picture", "reader", "stereo", "topics")
-)
 #: Files in the folders above that no row of a report runs: tiled maps, object storage, Qdrant, commands for finished maps, the
 #: comparison of stages, and training cities as files. A test checks that the benchmark loads none of them.
 NOT_RUN: dict[str, tuple[str, ...]] = {
@@ -210,19 +205,31 @@ NOT_RUN["real_data"] = (
     *_UPDATE,
     *(file for file in NOT_RUN["accuracy"] if file.startswith("model_training/") and file != STAGES),
 )
+#: Import of ROS bags. Other imports load none of these files.
+BAG_IMPORT = tuple(
+    f"model_training/importing/ros_{part}.py"
+    for part in ("bag", "cloud", "content", "frames", "pairs", "picture", "reader", "stereo", "topics")
+)
+#: Options of the import that no row gives.
+OPTIONS_OF_IMPORTS = ("model_training/importing/turn_times.py",)
+#: Rows that import a bag.
+_OF_BAGS = ("import.", "roundtrip.bag.", "roundtrip.mcap.")
 #: Files that only some rows of a report run, by the beginning of their ids.
 ONLY_RUN_BY: dict[str, dict[str, tuple[str, ...]]] = {
     "accuracy": {
         "service/localization/tracker.py": ("filter.",),
         "service/maps/inverted_file.py": (),
         **dict.fromkeys(_UPDATE, ("survey.two_passes_",)),
+        **dict.fromkeys((*BAG_IMPORT, *OPTIONS_OF_IMPORTS), ()),
     },
+    "kitti": dict.fromkeys((*BAG_IMPORT, *OPTIONS_OF_IMPORTS), ()),
     "real_data": {
         STAGES: tuple(f"real.kitti_{drive}.{row}" for drive in ("0005", "0013") for row in ("inliers", "retrieval_at")),
         "service/localization/tracker.py": ("real.track.", "ros2."),
         "service/maps/inverted_file.py": (),
-        **dict.fromkeys(BAG_READERS, ("roundtrip.mcap.", "roundtrip.bag.", "import.")),
         **dict.fromkeys(TILED_AND_STORED, ("resume.", "ros2.")),  # these rows start commands in processes of their own
+        **dict.fromkeys(BAG_IMPORT, _OF_BAGS),
+        **dict.fromkeys(OPTIONS_OF_IMPORTS, ()),
     },
     # The maps of this report are folders. Only a map in object storage is fetched.
     "serving": {"service/maps/store": ("fuzz.",), "service/runtime/fetch_log.py": ("fuzz.",)},

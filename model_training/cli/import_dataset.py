@@ -17,6 +17,7 @@ from model_training.importing.recording import Recording
 from model_training.importing.ros_topics import ROLES
 from model_training.importing.take import TakeSettings, TakeSummary, take
 from model_training.importing.trajectory import Sync, Trajectory
+from model_training.importing.turn_times import STAMPS, with_turn_times
 from model_training.odometry.align_poses import ALIGNED_KINDS, HOW_TO_ALIGN, usual_poses
 from service.errors import DatasetError
 from service.imaging.pca import USUAL_LIDAR_HEIGHT_M
@@ -142,6 +143,14 @@ def command(
             "gives the times.  [default: deskew]"
         ),
     ] = None,
+    turn_stamp: Annotated[
+        str | None,
+        typer.Option(
+            help="For a spinning LiDAR whose points have no times: the moment of the turn that the stamp of a scan means, begin, middle or "
+            "end. The order of the points then gives their times, and the scans are de-skewed. For rosbag and clouds. The driver's manual "
+            "tells the moment.  [default: no times]"
+        ),
+    ] = None,
     vertical_correction: Annotated[
         bool | None,
         typer.Option(
@@ -160,6 +169,7 @@ def command(
       streetfix import rosbag drive.mcap --topic scan=/ouster/points --out data/drive
       streetfix import rosbag drive.mcap --topic right_info=/stereo/right/camera_info --out data/drive
       streetfix import rosbag stereo.mcap --depth sgbm --out data/drive
+      streetfix import rosbag drive.mcap --turn-stamp end --out data/drive
       streetfix import clouds scans/ --odometry --out data/site
       streetfix import rosbag drive.mcap --georeference 48.98,8.44,110,90 --out data/town
       streetfix import kitti-object KITTI --depth sgbm --out data/kitti
@@ -186,6 +196,7 @@ def command(
         "georeference": georeference,
         "rectified": rectified,
         "deskew": deskew,
+        "turn-stamp": turn_stamp,
         "vertical-correction": vertical_correction,
     }
     refuse_unused(kind, given)
@@ -194,6 +205,10 @@ def command(
         return
     if sync not in (None, "interpolate", "nearest"):
         raise DatasetError(f"sync: {sync!r} is not valid; choose interpolate or nearest", field="sync")
+    if turn_stamp is not None and turn_stamp not in STAMPS:
+        raise DatasetError(
+            f"turn-stamp: {turn_stamp!r} is not valid; choose one of: {', '.join(STAMPS)}", field="turn-stamp"
+        )
     with_pictures = pictures is not False
     map_origin = None if georeference is None else read_map_origin(georeference)
     settings = TakeSettings(
@@ -225,6 +240,8 @@ def command(
     if odometry and align is not None:
         raise DatasetError("align: --odometry finds poses from the scans alone; give one of the two", field="align")
     recording = open_recording(kind, source, open_settings)
+    if turn_stamp is not None:
+        recording = with_turn_times(recording, turn_stamp, source=str(source))
     is_placed = recording.georeference is not None
     if is_placed and map_origin is not None and poses is None and not odometry:
         raise DatasetError(
@@ -326,7 +343,7 @@ def _print_summary(console: Console, out: Path, summary: TakeSummary, *, deskew:
     elif not summary.deskewed:
         why = (
             ", because their points have no usable times; unless they are corrected already, record clouds with a time for each point, or "
-            "correct them before the import"
+            "correct them before the import; --turn-stamp gives times to the clouds of a spinning LiDAR (rosbag, clouds)"
         )
     console.print(text + why, soft_wrap=True)
     if summary.points_without_numbers:

@@ -8,7 +8,12 @@ from service.errors import DatasetError
 
 #: Frames without poses, each a place of its own, are imported another way than drives.
 SINGLE_FRAMES = "kitti-object"
-_TAKES = {**{name: kind.takes for name, kind in KINDS.items()}, SINGLE_FRAMES: frozenset({"depth"})}
+#: Formats whose clouds may come from a spinning LiDAR without times of points. The command adds the times to the opened recording.
+_TURNING = frozenset({"rosbag", "clouds"})
+_TAKES = {
+    **{name: kind.takes | ({"turn-stamp"} if name in _TURNING else set()) for name, kind in KINDS.items()},
+    SINGLE_FRAMES: frozenset({"depth"}),
+}
 #: Options that work only with another one.
 _NEEDS = {"hold-out-first": "hold-out", "loops": "odometry", "lidar-height": "odometry"}
 #: Options of the images, and formats whose scans come from the images, so that they need a camera without images too.
@@ -34,6 +39,11 @@ def refuse_unused(kind: str, given: Mapping[str, object]) -> None:
     if kind not in _TAKES:
         raise DatasetError(f"kind: {kind!r} is not a known format; choose one of: {', '.join(kinds())}", field="kind")
     told = {option: value for option, value in given.items() if value is not None}
+    if "turn-stamp" in told and told.get("deskew") is False:
+        raise DatasetError(
+            f"--turn-stamp {told['turn-stamp']}: --no-deskew needs no times of points; omit one of the two",
+            field="turn-stamp",
+        )
     for option, value in told.items():
         if option not in _TAKES[kind]:
             users = [name for name in kinds() if option in _TAKES[name]]

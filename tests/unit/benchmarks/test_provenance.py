@@ -6,11 +6,21 @@ from pathlib import Path
 import pytest
 
 from benchmarks import provenance
-from benchmarks.provenance import BAG_READERS, MEASURED, NOT_RUN, ROOT, TILED_AND_STORED, mark_stale, measured_paths
+from benchmarks.provenance import (
+    BAG_IMPORT,
+    MEASURED,
+    NOT_RUN,
+    OPTIONS_OF_IMPORTS,
+    ROOT,
+    TILED_AND_STORED,
+    mark_stale,
+    measured_paths,
+)
 from model_training.calibration.answer_code import code_of_answers
 from service.maps import inverted_file
 
 REPORTS = sorted((ROOT / "reports").glob("*.json"))
+IMPORTING = ROOT / "model_training" / "importing"
 
 
 @pytest.fixture
@@ -186,14 +196,25 @@ def loaded():
 def test_a_benchmark_does_not_load_what_it_claims_not_to_run(loaded, report):
     files = loaded[report]
     assert ROOT / "model_training" / "mapping" / "build.py" in files
-    for path in {*NOT_RUN[report], *TILED_AND_STORED, *(BAG_READERS if report == "real_data" else ())}:
+    for path in {*NOT_RUN[report], *TILED_AND_STORED}:
         assert (ROOT / path).exists(), path
         assert not [each for each in files if each.is_relative_to(ROOT / path)], path
 
 
-def test_every_file_of_the_reader_of_bags_counts_for_the_rows_that_import_bags():
-    folder = ROOT / "model_training" / "importing"
-    assert {str(path.relative_to(ROOT)) for path in folder.glob("ros_*.py")} == set(BAG_READERS)
+@pytest.mark.parametrize("report", ["accuracy", "kitti", "real_data"])
+def test_only_rows_that_import_a_bag_depend_on_its_import(loaded, report):
+    """``open_recording`` loads these files for a bag alone. So loading a benchmark loads none of them."""
+    assert set(BAG_IMPORT) == {f"model_training/importing/{file.name}" for file in IMPORTING.glob("ros_*.py")}
+    assert IMPORTING / "kinds.py" in loaded[report]
+    for path in (*BAG_IMPORT, *OPTIONS_OF_IMPORTS):
+        assert (ROOT / path).exists(), path
+        assert ROOT / path not in loaded[report], path
+    assert {provenance.ONLY_RUN_BY[report][path] for path in OPTIONS_OF_IMPORTS} == {()}
+    rows = {rows for file, rows in provenance.ONLY_RUN_BY[report].items() if file in BAG_IMPORT}
+    of_bags = ("import.", "roundtrip.bag.", "roundtrip.mcap.") if report == "real_data" else ()
+    assert rows == {of_bags}
+    ids = [row["id"] for row in json.loads((ROOT / "reports" / f"{report}.json").read_text())["rows"]]
+    assert {beginning for beginning in of_bags if any(row_id.startswith(beginning) for row_id in ids)} == set(of_bags)
 
 
 def test_the_maps_of_accuracy_rows_have_no_search_index():

@@ -40,6 +40,7 @@ VALUES: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
     "georeference": (("--georeference", "-33.87,151.21,20,90"), ()),
     "rectified": (("--no-rectified",), ()),
     "deskew": (("--no-deskew",), ()),
+    "turn-stamp": (("--turn-stamp", "end"), ()),
     "vertical-correction": (("--no-vertical-correction",), ()),
 }
 DEPTH_OF_SINGLE_FRAMES = ("--depth", "stored")
@@ -79,6 +80,10 @@ def calls(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[Any]:
         made.append(("open", repr(settings)))
         return Nothing(kind)
 
+    def turning(recording: Nothing, stamp: str, *, source: str) -> Nothing:
+        made.append(("times", stamp, source))
+        return recording
+
     def posed(recording: Nothing, trajectory: Trajectory, *, align: bool | None, report: object) -> Any:
         made.append(("poses", trajectory.name, align))
         return trajectory, None
@@ -97,6 +102,7 @@ def calls(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[Any]:
 
     for name, stand_in in (
         ("open_recording", opened),
+        ("with_turn_times", turning),
         ("usual_poses", posed),
         ("take", taken),
         ("import_kitti_object", single),
@@ -113,6 +119,8 @@ def run(kind: str, *options: str) -> int:
 
 
 def takes(kind: str, option: str) -> bool:
+    if option == "turn-stamp":
+        return kind in ("rosbag", "clouds")
     return option == "depth" if kind == SINGLE_FRAMES else option in KINDS[kind].takes
 
 
@@ -151,6 +159,8 @@ def test_an_option_changes_the_import_or_is_refused_with_its_value(
         (("--queries", "x", "--no-pictures"), "--queries x: --no-pictures imports no images; omit one of the two"),
         (("--depth", "lidar", "--no-pictures"), "--depth lidar: --no-pictures imports no images"),
         (("--camera", "camera.json", "--no-pictures"), "--camera camera.json: --no-pictures imports no images"),
+        (("--turn-stamp", "end", "--no-deskew"), "--turn-stamp end: --no-deskew needs no times of points; omit one"),
+        (("--turn-stamp", "start"), "turn-stamp: 'start' is not valid; choose one of: begin, middle, end"),
         (("--odometry", "--no-align"), "align: --odometry finds poses from the scans alone; give one of the two"),
     ],
 )
@@ -201,7 +211,7 @@ def test_a_georeference_of_the_recording_is_not_replaced_and_does_not_hold_for_o
             0,
             (
                 "0 of 3 scans, because their points have no usable times; unless they are corrected already, record clouds with a time for "
-                "each point, or correct them before the import"
+                "each point, or correct them before the import; --turn-stamp gives times to the clouds of a spinning LiDAR (rosbag, clouds)"
             ),
         ),
     ],
