@@ -199,10 +199,13 @@ def _failure(block: Block, work: Path, environment: dict[str, str]) -> str | Non
 def _run(block: Block, work: Path, environment: dict[str, str]) -> None:
     address = f"127.0.0.1:{environment['STREETFIX_PORT']}"
     commands = [block.text] if block.kind == "python" else commands_of(block)
-    commands = [command.replace(_HTTP, address).replace(_GRPC, str(_free_port())) for command in commands]
+    grpc_port = _free_port()
+    commands = [command.replace(_HTTP, address).replace(_GRPC, str(grpc_port)) for command in commands]
     serves = [command for command in commands if _serves(command)]
-    asks = any(address in command for command in commands) and not serves
-    with _in_background("streetfix serve maps/small" if asks else None, work, environment):
+    asks_grpc = any(f"127.0.0.1:{grpc_port}" in command for command in commands)
+    asks = asks_grpc or any(address in command for command in commands)
+    service = f"streetfix serve maps/small{f' --grpc-port {grpc_port}' if asks_grpc else ''}"
+    with _in_background(service if asks and not serves else None, work, environment):
         if block.kind == "python":
             _call([sys.executable, "-c", commands[0]], work, environment)
             return

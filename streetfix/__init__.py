@@ -25,6 +25,7 @@ if TYPE_CHECKING:
         PriorPosition,
         PriorWgs84,
         RefusedError,
+        StreamFrame,
         StreetfixError,
         Track,
     )
@@ -51,6 +52,7 @@ __all__ = [
     "PriorWgs84",
     "Query",
     "RefusedError",
+    "StreamFrame",
     "StreetfixError",
     "Track",
 ]

@@ -7,8 +7,9 @@ from typing import TYPE_CHECKING, Any
 
 from service.client.async_client import AsyncClient
 from service.client.client import Client
-from service.client.prepare import Frame, RequestOptions, SequenceOptions, Track
+from service.client.prepare import Frame, RequestOptions, SequenceOptions, StreamFrame, StreamOptions, Track
 from service.client.retry import RetryPolicy
+from service.client.stream_answer import StreamAnswer
 from service.contract.schema import (
     LocalizeAnswer,
     MapEntry,
@@ -61,6 +62,9 @@ __all__ = [
     "RequestOptions",
     "RetryPolicy",
     "SequenceOptions",
+    "StreamAnswer",
+    "StreamFrame",
+    "StreamOptions",
     "StreetfixError",
     "Track",
     "UnavailableError",

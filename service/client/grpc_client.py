@@ -1,8 +1,9 @@
-"""The synchronous gRPC client, with the calls and answers of the HTTP client."""
+"""The synchronous gRPC client, with the calls and answers of the HTTP client, and the stream of a moving robot."""
 
 import random
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Generator, Iterable, Sequence
+from contextlib import AbstractContextManager, suppress
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self, TypeVar, Unpack
@@ -12,13 +13,25 @@ import grpc
 from service.client import grpc_messages, prepare
 from service.client.cells import HEADER, cell_of
 from service.client.encode import JPEG_QUALITY, Packing
+from service.client.epochs import Epochs
 from service.client.grpc_errors import errors_of_grpc, refused_in_batch
-from service.client.prepare import Camera, Depth, Frame, RequestOptions, Rgb, SequenceOptions
+from service.client.prepare import (
+    Camera,
+    Depth,
+    Frame,
+    RequestOptions,
+    Rgb,
+    SequenceOptions,
+    StreamFrame,
+    StreamOptions,
+)
 from service.client.rest import geojson
 from service.client.retry import Attempts, RetryPolicy
+from service.client.stream_answer import StreamAnswer
+from service.client.stream_call import StreamCall
 from service.client.tls import ClientTls
 from service.contract.schema import LocalizeAnswer, MapEntry
-from service.errors import RefusedError, RequestError, StreetfixError
+from service.errors import RefusedError, RequestError, StreetfixError, UnreachableError
 from service.grpc.generated.streetfix.v1 import localization_pb2 as pb
 from service.grpc.generated.streetfix.v1.localization_pb2_grpc import LocalizationServiceStub
 from service.imaging.raw16 import Codec
@@ -34,12 +47,14 @@ _OPTIONS = (
 
 
 class GrpcClient:
-    """Synchronous gRPC client of a service, with the methods of ``Client``. Several threads may use it at the same time.
+    """Synchronous gRPC client of a service, with the methods of ``Client`` and ``localize_stream``.
+
+    Several threads may use it at the same time.
 
     Args:
         address: address of the service, ``HOST:PORT``.
         api_key: API key, if the service requires one.
-        timeout_s: timeout of one whole attempt, seconds.
+        timeout_s: timeout of one whole attempt, seconds. In a stream it is that of one answer.
         retry: when to try again. The default is ``RetryPolicy()``.
         quality: JPEG quality of the colour image, 1 to 100. None sends PNG.
         depth_codec: codec of the raw16 depth image. lz4 needs less processor time on both sides and more bytes than zstd.
@@ -166,6 +181,82 @@ class GrpcClient:
         first, message = prepared.document.requests[0], grpc_messages.batch_message(prepared)
         return self._call(self._stub.LocalizeBatch, message, _outcomes, cell_of(first.prior, first.map))
 
+    def localize_stream(
+        self, frames: Iterable[StreamFrame], **about: Unpack[StreamOptions]
+    ) -> Generator[StreamAnswer | RefusedError, None, None]:
+        """Localize a moving robot frame by frame. The service keeps its track as long as the stream is open.
+
+        The generator takes a frame, sends it, waits for its answer, yields the answer, and only then takes the next frame. So the
+        iterable may be a live camera. It runs in the thread of the caller, and its errors reach the caller.
+
+        If the service refuses a frame, the generator yields a ``RefusedError`` in the place of its answer. The next frame begins the
+        track again. If the connection is lost, or if the service has no room for another stream, the generator opens the stream
+        again, sends the frame again and begins the track again. It does so within the limits of ``RetryPolicy``, which hold for each
+        frame. ``belief.epoch`` never falls, also over several connections.
+
+        The stream ends with the last frame, with an error, or with ``close()`` of the generator. A ``for`` loop that ends early closes
+        the generator when nothing else refers to it.
+
+        Args:
+            frames: the frames of one robot, in order.
+            **about: optional data that holds for every frame; see ``StreamOptions``.
+
+        Yields:
+            For each frame its answer, or the ``RefusedError`` of the service.
+
+        Raises:
+            RequestError: a frame is invalid. ``field`` names it. The frames before have their answers.
+            RefusedError: the service ended the stream, for example because of a wrong API key.
+            UnavailableError: the service still has no room after the last attempt.
+            NoAnswerInTimeError: no answer to a frame within ``timeout_s``.
+            UnreachableError: the connection is lost, and the last attempt failed.
+            TypeError: ``about`` has an unknown key.
+        """
+        prepare.only_stream_options(about)
+        return self._outcomes_of(frames, about)
+
+    def _outcomes_of(
+        self, frames: Iterable[StreamFrame], about: StreamOptions
+    ) -> Generator[StreamAnswer | RefusedError, None, None]:
+        call: StreamCall | None = None
+        last: StreamAnswer | None = None
+        epochs = Epochs()
+        try:
+            for number, frame in enumerate(frames):
+                prepared = prepare.stream_frame(number, frame, about, self._packing)
+                attempts = Attempts(self._policy, self._clock, self._draw)
+                while True:
+                    begins = call is None
+                    try:
+                        with self._errors():
+                            call = call or self._open_stream(
+                                cell_of(prepared.document.prior, prepared.document.map, last)
+                            )
+                            response = call.ask(grpc_messages.stream_message(prepared, begins=begins))
+                            outcome = _frame_outcome(response)
+                        break
+                    except StreetfixError as error:
+                        if call is not None:
+                            call.cancel()
+                        call = None
+                        epochs.interrupt()
+                        wait_s = attempts.wait_after(error)
+                    self._sleep(wait_s)
+                if isinstance(outcome, StreamAnswer):
+                    outcome = last = epochs.counted(outcome)
+                yield outcome
+            if call is not None:
+                # Every frame has its answer, so a connection that is lost now takes nothing from the caller.
+                with suppress(UnreachableError), self._errors():
+                    call.finish()
+        finally:
+            if call is not None:
+                call.cancel()
+
+    def _open_stream(self, cell: str) -> StreamCall:
+        metadata = self._metadata_of(cell)
+        return StreamCall(self._stub.LocalizeStream, metadata, address=self._address, timeout_s=self._timeout_s)
+
     def maps(self) -> list[MapEntry]:
         """Return all mounted maps, as ``Client.maps`` does."""
         return self._call(
@@ -187,14 +278,26 @@ class GrpcClient:
     def _call(self, method: Callable[..., M], message: object, read: Callable[[M], A], cell: str | None = None) -> A:
         """Call a method until it succeeds or must not be tried again; a proxy may choose the instance by the cell."""
         attempts = Attempts(self._policy, self._clock, self._draw)
-        metadata = self._metadata if cell is None else (*self._metadata, (HEADER.lower(), cell))
+        metadata = self._metadata_of(cell)
         while True:
             try:
-                with errors_of_grpc(self._address, self._timeout_s, self._tls if self._speaks_tls else None):
+                with self._errors():
                     return read(method(message, timeout=self._timeout_s, metadata=metadata))
             except StreetfixError as error:
                 wait_s = attempts.wait_after(error)
             self._sleep(wait_s)
+
+    def _metadata_of(self, cell: str | None) -> tuple[tuple[str, str], ...]:
+        return self._metadata if cell is None else (*self._metadata, (HEADER.lower(), cell))
+
+    def _errors(self) -> AbstractContextManager[None]:
+        return errors_of_grpc(self._address, self._timeout_s, self._tls if self._speaks_tls else None)
+
+
+def _frame_outcome(message: pb.LocalizeStreamResponse) -> StreamAnswer | RefusedError:
+    if message.outcome.HasField("answer"):
+        return grpc_messages.stream_answer_of(message)
+    return refused_in_batch(message.outcome.problem)
 
 
 def _outcomes(message: pb.LocalizeBatchResponse) -> list[LocalizeAnswer | RefusedError]:

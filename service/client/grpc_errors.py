@@ -41,8 +41,20 @@ def errors_of_grpc(address: str, timeout_s: float, tls: ClientTls | None) -> Ite
         ) from error
 
 
+def no_answer_in_time(address: str, timeout_s: float) -> NoAnswerInTimeError:
+    """Return the error for an answer that did not come in time.
+
+    Args:
+        address: address of the service.
+        timeout_s: the timeout, seconds.
+    """
+    return NoAnswerInTimeError(
+        f"{address}: no answer within {timeout_s:g} s; try again, or raise timeout_s", field="timeout_s"
+    )
+
+
 def refused_in_batch(problem: pb.Problem) -> RefusedError:
-    """Return the error for one refused query of a batch.
+    """Return the error for one refused query of a batch, or for one refused frame of a stream.
 
     Args:
         problem: the problem that the service reported for this query.
@@ -66,9 +78,7 @@ def _of(error: grpc.RpcError, address: str, timeout_s: float, tls: ClientTls | N
     if isinstance(info, error_details_pb2.ErrorInfo):
         return _refused(error, details, info)
     if code == grpc.StatusCode.DEADLINE_EXCEEDED:
-        return NoAnswerInTimeError(
-            f"{address}: no answer within {timeout_s:g} s; try again, or raise timeout_s", field="timeout_s"
-        )
+        return no_answer_in_time(address, timeout_s)
     if code in (grpc.StatusCode.UNAVAILABLE, grpc.StatusCode.CANCELLED):
         handshake = None if tls is None else handshake_error(address, said)
         if handshake is not None:

@@ -3,6 +3,7 @@
 from typing import Any
 
 from service.client.prepare import PreparedRequest
+from service.client.stream_answer import StreamAnswer
 from service.contract import schema
 from service.grpc.generated.streetfix.v1 import localization_pb2 as pb
 
@@ -63,6 +64,35 @@ def sequence_message(prepared: PreparedRequest[schema.SequenceRequest]) -> pb.Lo
     )
 
 
+def stream_message(prepared: PreparedRequest[schema.LocalizeRequest], *, begins: bool) -> pb.LocalizeStreamRequest:
+    """Return the message for a frame of a stream.
+
+    Args:
+        prepared: the request and its encoded images. Its track has the odometry.
+        begins: True for the first frame of a call. Its odometry is not sent, because it refers to a frame that the call does not have.
+    """
+    frame = prepared.document
+    odometry = None if begins or frame.track is None else _track(frame.track)
+    message = pb.LocalizeStreamRequest(frame=_pair(frame.model_copy(update={"track": None}), prepared.pictures[0]))
+    if odometry is not None and odometry.HasField("previous_from_camera"):
+        message.previous_from_camera.CopyFrom(odometry.previous_from_camera)
+        if odometry.HasField("odometry_std"):
+            message.odometry_std.CopyFrom(odometry.odometry_std)
+    return message
+
+
+def stream_answer_of(message: pb.LocalizeStreamResponse) -> StreamAnswer:
+    """Convert the answer to a frame of a stream.
+
+    Args:
+        message: the response, whose outcome is an answer.
+
+    Raises:
+        ValueError: a value violates the contract.
+    """
+    return StreamAnswer.model_validate(_answer_content(message.outcome.answer) | {"frames": message.frames})
+
+
 def answer_of(message: pb.LocalizeResponse) -> schema.LocalizeAnswer:
     """Convert an answer to the contract's model.
 
@@ -72,59 +102,60 @@ def answer_of(message: pb.LocalizeResponse) -> schema.LocalizeAnswer:
     Raises:
         ValueError: a value violates the contract.
     """
+    return schema.LocalizeAnswer.model_validate(_answer_content(message))
+
+
+def _answer_content(message: pb.LocalizeResponse) -> dict[str, Any]:
     times = message.timings
-    return schema.LocalizeAnswer.model_validate(
-        {
-            "status": pb.LocalizationStatus.Name(message.status).removeprefix(_STATUS_PREFIX),
-            "confidence": message.confidence if message.HasField("confidence") else None,
-            "street": _street_content(message.street) if message.HasField("street") else None,
-            "pose": _pose_content(message.pose) if message.HasField("pose") else None,
-            "vehicle_pose": _pose_content(message.vehicle_pose) if message.HasField("vehicle_pose") else None,
-            "geopose": _geopose_content(message.geopose) if message.HasField("geopose") else None,
-            "hypotheses": [
-                {
-                    "confirmed": each.confirmed,
-                    "pose": _pose_content(each.pose),
-                    "share": each.share,
-                    "inliers": each.inliers,
-                    "similarity": each.similarity,
-                }
-                for each in message.hypotheses
-            ],
-            "spread": _spread_content(message.spread) if message.HasField("spread") else None,
-            "reasons": [
-                {"check": each.check, "evidence": dict(each.evidence), "remedy": each.remedy}
-                for each in message.reasons
-            ],
-            "neighbours": [
-                {
-                    "place": each.place,
-                    "distance": each.distance,
-                    "similarity": each.similarity,
-                    "street": each.street if each.HasField("street") else None,
-                    "position": _xyz(each.position),
-                    "heading_deg": each.heading_deg,
-                }
-                for each in message.neighbours
-            ],
-            "camera_height": _height_content(message.camera_height) if message.HasField("camera_height") else None,
-            "calibration": _CALIBRATION.get(message.calibration),
-            "extrapolated": dict(message.extrapolated),
-            "threshold": {
-                "confidence": message.threshold.confidence,
-                "false_accept_rate": message.threshold.false_accept_rate,
+    return {
+        "status": pb.LocalizationStatus.Name(message.status).removeprefix(_STATUS_PREFIX),
+        "confidence": message.confidence if message.HasField("confidence") else None,
+        "street": _street_content(message.street) if message.HasField("street") else None,
+        "pose": _pose_content(message.pose) if message.HasField("pose") else None,
+        "vehicle_pose": _pose_content(message.vehicle_pose) if message.HasField("vehicle_pose") else None,
+        "geopose": _geopose_content(message.geopose) if message.HasField("geopose") else None,
+        "hypotheses": [
+            {
+                "confirmed": each.confirmed,
+                "pose": _pose_content(each.pose),
+                "share": each.share,
+                "inliers": each.inliers,
+                "similarity": each.similarity,
             }
-            if message.HasField("threshold")
-            else None,
-            "rig_correction": message.rig_correction if message.HasField("rig_correction") else None,
-            "belief": _belief_content(message.belief) if message.HasField("belief") else None,
-            "map": {"name": message.map.name, "version": message.map.version},
-            "timings_ms": {
-                stage: getattr(times, f"{stage}_ms")
-                for stage in ("decode", "fuse", "encode", "search", "register", "total")
-            },
+            for each in message.hypotheses
+        ],
+        "spread": _spread_content(message.spread) if message.HasField("spread") else None,
+        "reasons": [
+            {"check": each.check, "evidence": dict(each.evidence), "remedy": each.remedy} for each in message.reasons
+        ],
+        "neighbours": [
+            {
+                "place": each.place,
+                "distance": each.distance,
+                "similarity": each.similarity,
+                "street": each.street if each.HasField("street") else None,
+                "position": _xyz(each.position),
+                "heading_deg": each.heading_deg,
+            }
+            for each in message.neighbours
+        ],
+        "camera_height": _height_content(message.camera_height) if message.HasField("camera_height") else None,
+        "calibration": _CALIBRATION.get(message.calibration),
+        "extrapolated": dict(message.extrapolated),
+        "threshold": {
+            "confidence": message.threshold.confidence,
+            "false_accept_rate": message.threshold.false_accept_rate,
         }
-    )
+        if message.HasField("threshold")
+        else None,
+        "rig_correction": message.rig_correction if message.HasField("rig_correction") else None,
+        "belief": _belief_content(message.belief) if message.HasField("belief") else None,
+        "map": {"name": message.map.name, "version": message.map.version},
+        "timings_ms": {
+            stage: getattr(times, f"{stage}_ms")
+            for stage in ("decode", "fuse", "encode", "search", "register", "total")
+        },
+    }
 
 
 def _belief_content(message: pb.Belief) -> dict[str, Any]:

@@ -123,6 +123,50 @@ class Frame:
     camera_height_std_m: float | None = None
 
 
+class StreamOptions(TypedDict, total=False):
+    """Optional data of a stream, as in ``RequestOptions``. It holds for every frame.
+
+    Attributes:
+        map: name of the map.
+        T_vehicle_camera: (4, 4), pose of the camera in the vehicle frame, metres.
+        options: what the answers contain.
+        vehicle_base_on_ground: whether the origin of the vehicle frame lies on the ground, as in ``RequestOptions``.
+    """
+
+    map: str | None
+    T_vehicle_camera: NDArray[Any] | None
+    options: schema.Options | None
+    vehicle_base_on_ground: bool
+
+
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class StreamFrame:
+    """One colour image and one depth image of a moving robot.
+
+    Attributes:
+        rgb, depth, camera: as in ``Frame``.
+        T_previous_camera: (4, 4), pose of this camera in the frame of the previous frame's camera, from odometry, metres. None in the
+            first frame. None later: the odometry is unknown, and the track begins again.
+        odometry_std: standard deviations of ``T_previous_camera``, as in ``Track``.
+        prior: prior knowledge of the camera's pose. It counts in the first frame of a track only.
+        gravity, depth_scale_m, depth_kind, max_range_m, baseline_m, camera_height_m, camera_height_std_m: as in ``RequestOptions``.
+    """
+
+    rgb: Rgb
+    depth: Depth
+    camera: Camera
+    T_previous_camera: NDArray[Any] | None = None
+    odometry_std: schema.OdometryStd | None = None
+    prior: schema.Prior | None = None
+    gravity: Sequence[float] | NDArray[Any] | None = None
+    depth_scale_m: float | None = None
+    depth_kind: str = "z"
+    max_range_m: float | None = None
+    baseline_m: float | None = None
+    camera_height_m: float | None = None
+    camera_height_std_m: float | None = None
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class PreparedRequest(Generic[D]):
     """A request with its encoded images.
@@ -222,6 +266,62 @@ def sequence(
     return PreparedRequest(document, tuple(pictures for _, pictures in said))
 
 
+def stream_frame(
+    number: int, frame: StreamFrame, about: StreamOptions, packing: Packing
+) -> PreparedRequest[schema.LocalizeRequest]:
+    """Build the request for the next frame of a stream. Its odometry is in ``track`` of the document, without a belief.
+
+    Args:
+        number: number of the frame, for messages.
+        frame: the frame.
+        about: optional data that holds for every frame.
+        packing: how images are encoded.
+
+    Raises:
+        RequestError: as ``one``, or the frame has an ``odometry_std`` and no ``T_previous_camera``. ``field`` begins with
+            ``frames.NUMBER``.
+    """
+    where = f"frames.{number}."
+    if frame.odometry_std is not None and frame.T_previous_camera is None:
+        field = f"{where}odometry_std"
+        raise RequestError(f"{field}: it needs T_previous_camera, which is missing; pass both", field=field)
+    pictures = Frame(
+        rgb=frame.rgb,
+        depth=frame.depth,
+        camera=frame.camera,
+        gravity=frame.gravity,
+        depth_scale_m=frame.depth_scale_m,
+        depth_kind=frame.depth_kind,
+        max_range_m=frame.max_range_m,
+        baseline_m=frame.baseline_m,
+        camera_height_m=frame.camera_height_m,
+        camera_height_std_m=frame.camera_height_std_m,
+    )
+    said, encoded = _frame(pictures, packing, where)
+    odometry = {
+        "T_previous_camera": _transform(frame.T_previous_camera, f"{where}T_previous_camera"),
+        "odometry_std": frame.odometry_std,
+    }
+    content = said | _of_all(SequenceOptions(**about, prior=frame.prior)) | {"track": odometry}
+    try:
+        document = _checked(lambda: schema.LocalizeRequest.model_validate(content))
+    except RequestError as error:
+        raise RequestError(f"{where}{error.message}", field=f"{where}{error.field}") from error
+    return PreparedRequest(document, (encoded,))
+
+
+def only_stream_options(about: StreamOptions) -> None:
+    """Refuse unknown options of a stream.
+
+    Args:
+        about: optional data of a stream.
+
+    Raises:
+        TypeError: ``about`` has an unknown key.
+    """
+    _only_known(about, StreamOptions)
+
+
 def _frame(frame: Frame, packing: Packing, where: str = "") -> tuple[dict[str, Any], tuple[bytes, bytes]]:
     """Return the request fields of one frame and its encoded images.
 
@@ -303,6 +403,12 @@ def _track(track: Track | None) -> dict[str, Any]:
             "track.before: this answer has no belief, because its request had no track; begin with track=Track()",
             field="track.before",
         )
+    if belief is not None and belief.token is None:
+        raise RequestError(
+            "track.before: this answer comes from a stream, which keeps the track itself; pass an answer of localize, or send this frame "
+            "with localize_stream",
+            field="track.before",
+        )
     T = _transform(track.T_previous_camera, "track.T_previous_camera")
     content = {"belief": None if belief is None else belief.token, "T_previous_camera": T}
     # An earlier service does not know odometry_std, so it is sent only if it is set.
@@ -369,7 +475,7 @@ def _transform(T: NDArray[Any] | None, field: str) -> dict[str, Any] | None:
     return {"position": position, "orientation": {"x": x, "y": y, "z": z, "w": w}}
 
 
-def _only_known(about: RequestOptions | SequenceOptions, known: type) -> None:
+def _only_known(about: RequestOptions | SequenceOptions | StreamOptions, known: type) -> None:
     if unknown := sorted(set(about) - set(known.__annotations__)):
         raise TypeError(f"unknown argument {unknown[0]!r}; pass one of {', '.join(known.__annotations__)}")
 

@@ -13,13 +13,27 @@ import pytest
 
 from service.bridge.asking import AskService
 from service.bridge.known import Known, Motion
-from service.client import Client, GrpcClient, OdometryStd, PinholeCamera, RefusedError, RequestError, Track
+from service.client import (
+    Client,
+    GrpcClient,
+    OdometryStd,
+    PinholeCamera,
+    RefusedError,
+    RequestError,
+    RetryPolicy,
+    StreamAnswer,
+    StreamFrame,
+    Track,
+)
 from service.contract.schema import MOST_TOKEN
 from service.grpc.generated.streetfix.v1 import localization_pb2 as pb
 from service.grpc.generated.streetfix.v1.localization_pb2_grpc import LocalizationServiceStub
+from service.grpc.server import GrpcServer
 from service.localization.track_bytes import MOST_BYTES
 from service.maps.content import BundleContent
 from service.maps.writer import write_bundle
+from service.runtime.engine import Engine
+from service.runtime.settings import Settings
 
 Parts = Callable[..., dict[str, bytes]]
 CAMERA = pb.Camera(width=64, height=48, fx=32, fy=32, cx=31.5, cy=23.5)
@@ -229,6 +243,62 @@ def test_a_stream_refuses_a_carried_track_and_goes_on(faces: Any, parts_of: Part
     assert refused.outcome.problem.field == "frame 0.track"
     assert "omit track" in refused.outcome.problem.detail
     assert answered.outcome.HasField("answer")
+
+
+def stream_frame(pictures: Any, T_previous_camera: Any = None) -> StreamFrame:
+    rgb, depth_m, camera = pictures
+    return StreamFrame(rgb=rgb, depth=depth_m, camera=camera, T_previous_camera=T_previous_camera)
+
+
+def test_the_client_follows_a_robot_over_a_stream(faces: Any, pictures: Any) -> None:
+    """The answers are those of a track that the client carries. A frame without odometry begins the track again."""
+    _, _, address = faces
+    rgb, depth_m, camera = pictures
+    steps = [None, T_STEP, None]
+    with GrpcClient(address) as client:
+        streamed = list(client.localize_stream(stream_frame(pictures, T) for T in steps))
+        carried = [client.localize(rgb, depth_m, camera, track=Track())]
+        for T in steps[1:]:
+            track = Track(before=carried[-1], T_previous_camera=T)
+            carried.append(client.localize(rgb, depth_m, camera, track=track))
+    assert [each.status for each in carried] == ["AMBIGUOUS", "LOCALIZED", "AMBIGUOUS"]
+    for there, here in zip(streamed, carried, strict=True):
+        assert isinstance(there, StreamAnswer)
+        assert there.belief is not None
+        assert here.belief is not None
+        assert (there.status, there.belief.epoch, there.belief.token) == (here.status, here.belief.epoch, None)
+        assert there.belief.modes[0].weight == pytest.approx(here.belief.modes[0].weight)
+        assert there.frames >= 1
+
+
+def test_a_stream_of_the_client_goes_on_with_another_service(
+    faces: Any, pictures: Any, content_of: Any, constant_calibration: Any, tmp_path: Path
+) -> None:
+    """The service ends after two frames, and another one answers at the same port. The robot had a pose, so the epoch rises."""
+    del faces
+    folder = tmp_path / "tiny"
+    write_bundle(folder, content_of(calibration=constant_calibration(right=RIGHT, known=KNOWN, threshold=THRESHOLD)))
+    engine = Engine.open(Settings(maps=(folder,), threads=1, queue=4))
+    first = GrpcServer(engine, host="127.0.0.1", port=0)
+    first.start()
+    second: list[GrpcServer] = []
+
+    def drive() -> Iterator[StreamFrame]:
+        yield stream_frame(pictures)
+        yield stream_frame(pictures, T_STEP)
+        first.stop(grace_s=0)
+        second.append(GrpcServer(engine, host="127.0.0.1", port=first.port))
+        second[0].start()
+        yield stream_frame(pictures, T_STEP)
+        yield stream_frame(pictures, T_STEP)
+
+    policy = RetryPolicy(attempts=20, total_s=60.0, backoff_s=0.2)
+    with GrpcClient(f"127.0.0.1:{first.port}", retry=policy) as client:
+        answers = [each for each in client.localize_stream(drive()) if isinstance(each, StreamAnswer)]
+    assert [each.status for each in answers] == ["AMBIGUOUS", "LOCALIZED", "AMBIGUOUS", "LOCALIZED"]
+    assert [each.belief and each.belief.epoch for each in answers] == [0, 0, 1, 1]
+    second[0].stop(grace_s=0)
+    engine.close()
 
 
 def changed(token: str) -> str:

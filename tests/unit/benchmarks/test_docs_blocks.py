@@ -29,3 +29,12 @@ def test_blocks_share_a_folder_and_failures_are_counted(page: Path, capsys: pyte
 def test_a_service_that_does_not_start_fails_its_block(page: Path) -> None:
     page.write_text("```sh\nstreetfix serve maps/none\necho asked\n```\n")
     assert docs_blocks.code_blocks_run(("page.md",)) == (0, 1)
+
+
+def test_a_block_that_asks_over_grpc_gets_a_service(page: Path, bundle_path: Path) -> None:
+    program = (
+        "from streetfix import GrpcClient\n"
+        "with GrpcClient('127.0.0.1:50051') as client: assert [each.name for each in client.maps()] == ['tiny']\n"
+    )
+    page.write_text(f"```sh\nmkdir maps\ncp -r {bundle_path} maps/small\n```\n```python\n{program}```\n")
+    assert docs_blocks.code_blocks_run(("page.md",)) == (2, 2)
