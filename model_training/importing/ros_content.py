@@ -10,7 +10,7 @@ from model_training.importing.extrinsics import Extrinsics
 from model_training.importing.ros_frames import FrameTree, stamp_of, transform_of
 from model_training.importing.ros_picture import baseline_of, camera_of
 from model_training.importing.ros_reader import BagReader, Damage
-from model_training.importing.ros_stereo import StereoRig, lookups_of, require_same_projection
+from model_training.importing.ros_stereo import StereoRig, lookups_of, offset_m, require_same_projection
 from model_training.importing.ros_topics import POSE_TYPES, SIDES, Topics, topics_of
 from model_training.importing.trajectory import Trajectory
 from service.bridge.pictures import is_rectified_by_name
@@ -149,6 +149,10 @@ def _rig(
         )
     infos = [None if topic is None else bag.first(topic.name) for topic in (topics.info, topics.right_info)]
     left, right = infos if settings.camera is None else (None, None)
+    if left is not None and right is not None:
+        baseline_m += offset_m(
+            left
+        )  # the right camera's P counts from the origin of the rig, which need not be the left camera
     if is_rectified(topics, settings):
         if left is not None and right is not None:
             require_same_projection(left, right, source=bag.name)

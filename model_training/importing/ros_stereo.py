@@ -111,6 +111,18 @@ def lookups_of(left: Any, right: Any, *, source: str) -> tuple[Lookup, Lookup]:
     return _lookup(left, projection, f"{source}, left camera"), _lookup(right, projection, f"{source}, right camera")
 
 
+def offset_m(message: Any) -> float:
+    """Return how far the origin of the rig lies to the right of a camera, metres: P[0, 3] over fx (sensor_msgs/CameraInfo).
+
+    It is 0 if the rig counts from its left camera. Bags of KITTI's colour cameras count from a grey one, 0.06 m to the right.
+
+    Args:
+        message: CameraInfo of the left camera.
+    """
+    P = _matrix(message, "p", (3, 4))
+    return float(P[0, 3] / P[0, 0]) if P[0, 0] > 0 and np.isfinite(P[0, 3]) else 0.0
+
+
 def require_same_projection(left: Any, right: Any, *, source: str) -> None:
     """Refuse rectified cameras whose projections differ.
 

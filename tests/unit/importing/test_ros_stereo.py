@@ -88,6 +88,14 @@ def test_rectified_pairs_become_images_with_depth_and_baseline(ros, tmp_path):
     assert line.startswith("stereo pairs: rectified, baseline 0.1600 m; right camera: rows ")
 
 
+def test_the_baseline_counts_from_the_left_camera_wherever_the_origin_of_the_rig_is(ros, tmp_path):
+    # KITTI's colour cameras: the left one is 0.06 m to the left of the origin, the right one 0.10 m to the right.
+    infos = (info_of(ros, baseline_m=-0.06), info_of(ros, baseline_m=BASELINE_M - 0.06))
+    (found, *_) = pictures(opened(ros.write(tmp_path / "bag", drive(ros, infos=infos))))
+    assert found.baseline_m == pytest.approx(BASELINE_M)
+    assert np.median(found.depth[INNER]) == pytest.approx(DEPTH_M, abs=0.02)
+
+
 def test_raw_pairs_are_rectified_by_both_calibrations(ros, tmp_path):
     # The raw right camera has its optical axis 6 columns farther to the right. Without rectification the disparity would be 2 px.
     middle = (WIDTH - 1) / 2
