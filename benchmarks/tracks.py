@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from benchmarks.carried_tracks import EQUAL_M, carried, equal
 from benchmarks.plans import SEQUENCE, TRACK_FRAMES, TRACK_STEP_M, other_track_plan, repeating_plan, track_plan
 from benchmarks.report import Report
 from benchmarks.runs import Runs
@@ -19,6 +20,8 @@ BEFORE = 4
 def track_rows(report: Report, runs: Runs) -> None:
     """Add rows ``filter.*``: answers of tracks, frames until a displacement is noticed, and wrong answers between look-alikes.
 
+    Rows ``filter.carried.*`` follow the robots of ``filter.in_map`` with a track that the client carries.
+
     Args:
         report: collects the rows.
         runs: simulates and builds, or reuses what is kept on disk.
@@ -32,6 +35,7 @@ def track_rows(report: Report, runs: Runs) -> None:
     report.share("filter.in_map.wrong_and_accepted", at_home.wrong(RIGHT_M).ravel(), better="lower")
     report.share("filter.in_map.disrupted", at_home.epoch[:, -1] > 0, better="lower")
     report.row("filter.in_map.frames", float(at_home.frames.mean()), "frames", better="lower", n=at_home.frames.size)
+    _carried_rows(report, own, drives, at_home)
     outside = _followed(other, drives)
     report.share("filter.outside.accepted", outside.accepted.ravel(), better="lower")
     _displaced_rows(report, _followed(own, displaced(drives, BEFORE, step_m=TRACK_STEP_M)))
@@ -41,6 +45,33 @@ def track_rows(report: Report, runs: Runs) -> None:
     between = [drive for drive, is_far in zip(alike, far_from_landmarks(last), strict=True) if is_far]
     found = _followed(runs.bundle(repeating), between)
     report.share("filter.no_landmark.wrong_and_accepted", found.wrong(RIGHT_M).ravel(), bar=0.005, better="lower")
+
+
+def _carried_rows(report: Report, bundle: MapBundle, drives: list[list[Step]], held: Tracks) -> None:
+    """Add the rows of the same robots with a track that the client carries, and compare them with the track that the service holds.
+
+    The service registers up to five frames together. The bytes have no images, so there each frame is registered alone.
+    """
+    with bars() as progress:
+        found = carried(Localizer.open(bundle), drives, progress)
+    tracks = found.tracks
+    report.share("filter.carried.last_frame", tracks.right(RIGHT_M)[:, -1])
+    report.share("filter.carried.wrong_and_accepted", tracks.wrong(RIGHT_M).ravel(), better="lower")
+    report.share(
+        "filter.carried.equal_answers",
+        equal(tracks, held).ravel(),
+        why=f"status, epoch and error (within {1e3 * EQUAL_M:g} mm) as in filter.in_map, where the service holds the track",
+    )
+    report.share(
+        "filter.carried.equal_answers_alone",
+        equal(tracks, held)[held.frames == 1],
+        why="the same for answers that register no earlier frame in filter.in_map",
+    )
+    report.share("filter.carried.equal_status", (tracks.accepted == held.accepted).ravel())
+    report.row("filter.carried.largest_bytes", float(found.sizes.max()), "bytes", better="lower", n=found.sizes.size)
+    report.row(
+        "filter.carried.median_bytes", float(np.median(found.sizes)), "bytes", better="lower", n=found.sizes.size
+    )
 
 
 def _displaced_rows(report: Report, found: Tracks) -> None:
