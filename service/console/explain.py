@@ -61,7 +61,7 @@ def explain(engine: Engine, encoded: EncodedQuery) -> Explanation:
     Raises:
         StreetfixError: as ``Engine.localize``.
     """
-    localizer = engine.registry.get(encoded.map_name)
+    localizer = engine.localizer_for(encoded)
     frame = engine.encode_and_search(localizer, encoded)
     located = engine.answer(localizer, (frame,))
     answer, bundle = located.answer, located.bundle

@@ -225,7 +225,7 @@ def query_of(request: GeoPoseRequest, map_name: str | None) -> EncodedQuery:
 
     Args:
         request: of the protocol.
-        map_name: map to use; None takes the only mounted map.
+        map_name: map to use; None takes the only mounted map, or the nearest one to the prior of the request.
 
     Raises:
         RequestError: a reading is missing or invalid. A colour image without its DEPTH image is also an error.

@@ -322,6 +322,7 @@ class Track(_Strict):
     )
 
 
+_MAP = "name of the map. Optional if only one map is mounted. With several maps, prior.wgs84 chooses the nearest georeferenced one"
 #: Examples. A camera that looks along the vehicle's x axis, 1.6 m above its origin; and its pose after 0.8 m of straight travel.
 _CAMERA: JsonDict = {"model": "PINHOLE", "width": 640, "height": 480, "fx": 320, "fy": 320, "cx": 319.5, "cy": 239.5}
 _DEPTH: JsonDict = {"scale_m": 0.001, "kind": "z", "max_range_m": 80}
@@ -351,7 +352,7 @@ class LocalizeRequest(_Strict):
         },
     )
 
-    map: str | None = Field(None, max_length=64, description="name of the map. Optional if only one map is mounted")
+    map: str | None = Field(None, max_length=64, description=_MAP)
     camera: Camera
     depth: Depth = Depth()
     gravity: Direction | None = Field(
@@ -430,7 +431,7 @@ class SequenceRequest(_Strict):
         }
     )
 
-    map: str | None = Field(None, max_length=64, description="name of the map. Optional if only one map is mounted")
+    map: str | None = Field(None, max_length=64, description=_MAP)
     frames: list[SequenceFrame] = Field(min_length=1, max_length=MOST_FRAMES)
     T_vehicle_camera: RigidTransform | None = Field(
         None,

@@ -72,7 +72,8 @@ class EncodedQuery:
         rgb: encoded RGB image.
         depth: encoded depth image.
         camera: intrinsics of both images.
-        map_name: map to localize in, as ``name`` or ``name@version``; None if only one is mounted.
+        map_name: map to localize in, as ``name`` or ``name@version``; None takes the only mounted map, or the nearest one to
+            ``prior_wgs84``.
         depth_encoding: file encoding of the depth image.
         depth_kind: meaning of the stored values.
         scale_m: metres per stored unit; None lets the format decide.
@@ -190,6 +191,18 @@ class Engine:
         """Mark the service as shutting down. It still answers. Safe to call from a signal handler."""
         self.is_draining = True
 
+    def localizer_for(self, encoded: EncodedQuery) -> Localizer:
+        """Return the localizer of the map that a query names, or of the map that is nearest to its prior on the Earth.
+
+        Args:
+            encoded: the query.
+
+        Raises:
+            NotReadyError: no map is mounted.
+            UnknownMapError: no map has that name; or the query names none, several maps are mounted, and its prior cannot choose one.
+        """
+        return self.registry.get(encoded.map_name, encoded.prior_wgs84)
+
     def localize(self, encoded: EncodedQuery) -> Located:
         """Decode and localize one query, in the thread of the caller.
 
@@ -198,7 +211,7 @@ class Engine:
 
         Raises:
             NotReadyError: no map is mounted.
-            UnknownMapError: no map has that name.
+            UnknownMapError: as ``localizer_for``.
             RequestError: an image cannot be decoded, has the wrong size, or holds no depth.
             UnsupportedFormatError: the format of an image is not supported.
             TooLargeError: an image exceeds the limits.
@@ -221,7 +234,7 @@ class Engine:
         Raises:
             StreetfixError: as for ``localize``; with several pairs its field is under ``frames.K``.
         """
-        localizer = self.registry.get(encoded[0].map_name)
+        localizer = self.localizer_for(encoded[0])
         frames = []
         for number, (each, T) in enumerate(zip(encoded, T_reference_camera, strict=True)):
             try:
@@ -282,7 +295,7 @@ class Engine:
         Raises:
             RequestError: the belief was not sealed by this service.
         """
-        localizer = self.registry.get(encoded.map_name)
+        localizer = self.localizer_for(encoded)
         version = f"{localizer.bundle.name}@{localizer.bundle.manifest.version}"
         track = Track()
         if carried.sealed_belief is not None:

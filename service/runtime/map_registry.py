@@ -12,6 +12,7 @@ from service.maps.manifest import FILE as MANIFEST_FILE
 from service.maps.manifest import Manifest, dataset_error
 from service.maps.tiles import open_map
 from service.retrieval.encoder import Provider
+from service.runtime.nearest_map import nearest_map
 from service.runtime.serving_table import Key, MapVersion, ServingTable, Table
 
 _log = logging.getLogger("streetfix.maps")
@@ -128,15 +129,18 @@ class MapRegistry:
         """Whether this process has any map open, mounted or not."""
         return bool(self._open)
 
-    def get(self, name: str | None) -> Localizer:
+    def get(self, name: str | None, near: tuple[float, float] | None = None) -> Localizer:
         """Return the localizer of a map.
 
         Args:
-            name: of the map, or ``name@version`` for one version. None takes the only mounted map.
+            name: of the map, or ``name@version`` for one version. None takes the only mounted map, or the nearest one to ``near``.
+            near: latitude and longitude where the camera is about, degrees; None if unknown. It counts if several maps are mounted
+                and the name is None.
 
         Raises:
             NotReadyError: no map is mounted.
-            UnknownMapError: no map has that name, or the name is None and several maps are mounted.
+            UnknownMapError: no map has that name; or several maps are mounted, the name is None, and ``near`` is None or no map is
+                georeferenced.
         """
         maps = self._maps()
         if not maps:
@@ -150,11 +154,15 @@ class MapRegistry:
             for localizer in maps[plain].versions if plain in maps else ():
                 if localizer.bundle.manifest.version == version:
                     return localizer
-        mounted = ", ".join(maps)
-        what = (
-            "several maps are mounted, and the request names none" if name is None else f"map {name[:100]!r} not found"
-        )
-        raise UnknownMapError(f"{what}; mounted maps: {mounted}", field="map")
+        what = f"map {(name or '')[:100]!r} not found"
+        if name is None:
+            nearest = None if near is None else nearest_map((each.serving for each in maps.values()), *near)
+            if nearest is not None:
+                return nearest
+            what = "several maps are mounted, and the request names none"
+            if near is not None:
+                what += "; prior.wgs84 cannot choose one, because none of them is georeferenced"
+        raise UnknownMapError(f"{what}; mounted maps: {', '.join(maps)}", field="map")
 
     def versions(self, name: str) -> tuple[Localizer, ...]:
         """Return every mounted version of a map, the newest first; empty for an unknown map.

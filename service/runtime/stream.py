@@ -68,7 +68,9 @@ class Stream:
                 "open another stream for another map",
                 field="map",
             )
-        self._localizer = self._engine.registry.get(self._name)
-        if self._name is None:  # it is the only map now, but others may be mounted later
+        if self._name is None:  # the frames after the first one keep to its map
+            self._localizer = self._engine.localizer_for(encoded)
             self._name = self._localizer.bundle.name
+        else:
+            self._localizer = self._engine.registry.get(self._name)
         return self._localizer

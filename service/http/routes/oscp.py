@@ -57,7 +57,8 @@ def router_for(runner: RequestRunner) -> APIRouter:
 
         Intrinsics follow COLMAP: the corner of the first pixel is (0, 0). DEPTH is a 16-bit PNG in millimetres or a float TIFF in
         metres. The axes of the accelerometer follow W3C. `heightAboveGround` of the camera's parameters is a field of this service:
-        the height of the camera above the ground, metres. `map` selects one of several maps.
+        the height of the camera above the ground, metres. `map` names one of several maps. Without it, the nearest map to the last of
+        `priorPoses`, or to the geolocation reading, answers.
 
         If the answer is not LOCALIZED, the response is the problem `no-pose`, because the protocol cannot express uncertainty.
         """

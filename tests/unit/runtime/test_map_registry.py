@@ -1,9 +1,11 @@
 from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from service.errors import BundleError, NotReadyError, UnknownMapError
+from service.geometry.earth import Georeference
 from service.localization.localizer import Localizer
 from service.maps.content import BundleContent
 from service.maps.reader import MapBundle
@@ -39,6 +41,69 @@ def test_an_unknown_map_is_refused_with_the_mounted_ones(two_maps: Path) -> None
 def test_with_several_maps_a_name_is_needed(two_maps: Path) -> None:
     with pytest.raises(UnknownMapError, match="names none; mounted maps: north, south"):
         MapRegistry.open([two_maps]).get(None)
+
+
+@pytest.fixture
+def on_the_earth(content_of: Callable[..., BundleContent], tmp_path: Path) -> MapRegistry:
+    """Maps whose origins lie 0.1 degrees (11.1 km) of latitude apart, and a map that is not georeferenced. Their places lie within 60 m."""
+    for name, georeference in (
+        ("north", {"latitude_deg": 50.1, "longitude_deg": 8.0}),
+        ("nowhere", None),
+        ("south", {"latitude_deg": 50.0, "longitude_deg": 8.0}),
+    ):
+        write_bundle(tmp_path / "maps" / name, content_of(name=name, georeference=georeference))
+    return MapRegistry.open([tmp_path / "maps"])
+
+
+@pytest.mark.parametrize(
+    ("near", "name"),
+    [
+        ((50.0, 8.0), "south"),
+        ((50.049, 8.0), "south"),
+        ((50.051, 8.0), "north"),
+        ((60.0, 8.0), "north"),  # outside of all maps
+        (
+            (-50.04, -172.0),
+            "north",
+        ),  # the other side of the Earth: x and y alone are smaller in the frame of the southern map
+    ],
+)
+def test_with_several_maps_the_nearest_one_to_a_position_on_the_earth_answers(
+    on_the_earth: MapRegistry, near: tuple[float, float], name: str
+) -> None:
+    assert on_the_earth.get(None, near).bundle.name == name
+
+
+def test_a_name_counts_before_a_position(on_the_earth: MapRegistry) -> None:
+    assert on_the_earth.get("south", (50.1, 8.0)).bundle.name == "south"
+    with pytest.raises(UnknownMapError, match="map 'west' not found"):
+        on_the_earth.get("west", (50.1, 8.0))
+
+
+def test_of_maps_that_reach_into_each_other_the_one_with_the_nearest_place_answers(
+    content_of: Callable[..., BundleContent], tmp_path: Path
+) -> None:
+    """The second map has a gap of 1 km, in which the first one lies."""
+    small, around = (
+        content_of(name=name, georeference={"latitude_deg": 50.0, "longitude_deg": 8.0}) for name in ("small", "around")
+    )
+    x = around.T_map_place[:, 0, 3]
+    x[: len(x) // 2] -= 500.0
+    x[len(x) // 2 :] += 500.0
+    for each in (small, around):
+        write_bundle(tmp_path / each.name, each)
+    registry, earth = MapRegistry.open([tmp_path / "small", tmp_path / "around"]), Georeference(50.0, 8.0)
+    for x_m, name in ((20.0, "small"), (-480.0, "around"), (520.0, "around"), (-200.0, "small"), (900.0, "around")):
+        assert registry.get(None, earth.to_earth(np.array([x_m, 0.0, 0.0]))[:2]).bundle.name == name
+
+
+def test_a_position_does_not_choose_among_maps_that_are_not_georeferenced(two_maps: Path) -> None:
+    with pytest.raises(UnknownMapError, match="prior.wgs84 cannot choose one, because none of them is georeferenced"):
+        MapRegistry.open([two_maps]).get(None, (50.0, 8.0))
+
+
+def test_the_only_map_answers_also_if_it_is_not_georeferenced(bundle_path: Path) -> None:
+    assert MapRegistry.open([bundle_path]).get(None, (50.0, 8.0)).bundle.name == "tiny"
 
 
 def test_the_same_version_twice_is_refused(bundle_path: Path, bundle_copy: Path) -> None:
