@@ -14,8 +14,8 @@ from service.maps.content import BundleContent
 from service.maps.writer import write_bundle
 
 Parts = Callable[..., dict[str, bytes]]
-CAMERA = {"width": 64, "height": 48, "fx": 32, "fy": 32, "cx": 31.5, "cy": 23.5}
-DEPTH = {"scale_m": 1}
+CAMERA: dict[str, Any] = {"width": 64, "height": 48, "fx": 32, "fy": 32, "cx": 31.5, "cy": 23.5}
+DEPTH: dict[str, Any] = {"scale_m": 1}
 #: Origins of the maps, degrees.
 ORIGINS = {"north": (50.1, 8.0), "south": (50.0, 8.0)}
 #: It neither moved nor turned.

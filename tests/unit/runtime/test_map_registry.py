@@ -98,7 +98,7 @@ def test_of_maps_that_reach_into_each_other_the_one_with_the_nearest_place_answe
 
 
 def test_a_position_does_not_choose_among_maps_that_are_not_georeferenced(two_maps: Path) -> None:
-    with pytest.raises(UnknownMapError, match="prior.wgs84 cannot choose one, because none of them is georeferenced"):
+    with pytest.raises(UnknownMapError, match=r"prior\.wgs84 cannot choose one, because none of them is georeferenced"):
         MapRegistry.open([two_maps]).get(None, (50.0, 8.0))
 
 
