@@ -38,7 +38,6 @@ class Map:
         calibration: confidence calibration. None if the map is not calibrated.
         cloud: the cloud. None if the map has nothing to register against.
         places_xy: x of all places, then y of all places, map frame, metres. In memory.
-        extent_m: the least and the largest x and y of the places, map frame, metres.
     """
 
     path: Path
@@ -53,12 +52,9 @@ class Map:
     calibration: Calibration | None
     cloud: Cloud | None
     places_xy: Float64[NDArray[np.float64], "2 P"] = field(init=False)
-    extent_m: Float64[NDArray[np.float64], "2 2"] = field(init=False)
 
     def __post_init__(self) -> None:
-        places_xy = np.ascontiguousarray(self.T_map_place[:, :2, 3].T)
-        object.__setattr__(self, "places_xy", places_xy)
-        object.__setattr__(self, "extent_m", np.stack([places_xy.min(axis=1), places_xy.max(axis=1)]))
+        object.__setattr__(self, "places_xy", np.ascontiguousarray(self.T_map_place[:, :2, 3].T))
 
     def searched(
         self,

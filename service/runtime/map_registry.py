@@ -12,7 +12,7 @@ from service.maps.manifest import FILE as MANIFEST_FILE
 from service.maps.manifest import Manifest, dataset_error
 from service.maps.tiles import open_map
 from service.retrieval.encoder import Provider
-from service.runtime.nearest_map import nearest_map
+from service.runtime.nearest_map import MapOnEarth, nearest_map
 from service.runtime.serving_table import Key, MapVersion, ServingTable, Table
 
 _log = logging.getLogger("streetfix.maps")
@@ -40,6 +40,7 @@ class _Map:
 
     versions: tuple[Localizer, ...]
     serving: Localizer
+    on_earth: MapOnEarth
 
 
 @dataclass(frozen=True, slots=True)
@@ -156,7 +157,7 @@ class MapRegistry:
                     return localizer
         what = f"map {(name or '')[:100]!r} not found"
         if name is None:
-            nearest = None if near is None else nearest_map((each.serving for each in maps.values()), *near)
+            nearest = None if near is None else nearest_map((each.on_earth for each in maps.values()), *near)
             if nearest is not None:
                 return nearest
             what = "several maps are mounted, and the request names none"
@@ -261,7 +262,7 @@ class MapRegistry:
         for name, known in table.maps.items():
             versions = {each.version: self._open[each.key] for each in known.versions if each.key in self._open}
             if known.serving in versions:
-                maps[name] = _Map(tuple(versions.values()), versions[known.serving])
+                maps[name] = _Map(tuple(versions.values()), serving := versions[known.serving], MapOnEarth(serving))
             elif offers is not None:  # must not happen: a worker joins only when it has all of them
                 _log.error("map_lacking name=%s version=%s", name, known.serving)
         self._view = _View(table, maps)
