@@ -3,7 +3,15 @@
 from collections.abc import Iterator
 from typing import Any
 
-from benchmarks.plans import SEQUENCE, SPARSE_M, hard_plan, lidar_16_plan, lidar_os0_plan, unseen_plan
+from benchmarks.plans import (
+    SEQUENCE,
+    SPARSE_M,
+    hard_plan,
+    lidar_16_plan,
+    lidar_os0_plan,
+    unseen_plan,
+    vehicle_ahead_plan,
+)
 from benchmarks.report import Report
 from benchmarks.runs import Runs, accepted_within, share, within
 from model_training.datasets.dataset import Dataset
@@ -26,9 +34,13 @@ def asked_of(runs: Runs) -> Iterator[Asked]:
         runs: simulates, builds and answers, or reuses what is kept on disk.
     """
     dataset = runs.dataset(hard_plan())
-    bundle = runs.bundle(runs.dataset(unseen_plan(0)))  # the same city: hard_plan has its seed
+    city = runs.bundle(runs.dataset(unseen_plan(0)))  # hard_plan has the seed of this city
     for name in ("clear", *HARD):
-        yield name, bundle, dataset, f"{name}_precise"
+        yield name, city, dataset, f"{name}_precise"
+    behind = runs.dataset(vehicle_ahead_plan())
+    for map_of, bundle in (("", city), ("_also_of_survey", runs.bundle(behind))):
+        yield f"vehicle_ahead{map_of}", bundle, behind, "vehicle_ahead_precise"
+        yield f"vehicle_ahead{map_of}_stereo", bundle, behind, "vehicle_ahead_stereo"
     yield (
         "survey_5m",
         runs.bundle(dataset, BuildSettings(name="hard-survey-5m", spacing_m=SPARSE_M)),

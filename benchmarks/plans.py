@@ -2,10 +2,11 @@
 
 from model_training.simulation.hard import HARD, hard_query
 from model_training.simulation.plan import QueryPlan, SimulationPlan
+from model_training.simulation.sensor_parameters import SurveyParameters
 from model_training.training.recipe import EVALUATION_SEEDS
 
 BOTH = ("precise", "stereo")
-HARD_COUNT, SEQUENCES, SEQUENCE = 500, 300, 5
+HARD_COUNT, AHEAD_COUNT, SEQUENCES, SEQUENCE = 500, 300, 300, 5
 LARGE_M = (600.0, 400.0)
 #: Distance between the scans of the conditions with a sparse survey, metres.
 SPARSE_M = 5.0
@@ -114,6 +115,17 @@ def lidar_os0_plan() -> SimulationPlan:
     """
     return SimulationPlan(
         name="hard-lidar-os0", seed=EVALUATION_SEEDS[1], lidar="os0_128", spacing_m=SPARSE_M, queries=()
+    )
+
+
+def vehicle_ahead_plan() -> SimulationPlan:
+    """Plan the same city on a clear day, with a vehicle ahead of the camera in every image and ahead of the survey on its whole way."""
+    queries = (QueryPlan(name="vehicle_ahead", traversal=41, count=AHEAD_COUNT, depths=BOTH, followed=1.0),)
+    return SimulationPlan(
+        name="hard-vehicle-ahead",
+        seed=EVALUATION_SEEDS[1],
+        survey_parameters=SurveyParameters(speed_m_s=8.0, followed=1.0),
+        queries=queries,
     )
 
 

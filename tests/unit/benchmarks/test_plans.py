@@ -16,6 +16,7 @@ from benchmarks.plans import (  # after the skip
     paper_plan,
     repeating_plan,
     unseen_plan,
+    vehicle_ahead_plan,
 )
 from benchmarks.runs import pooled
 from model_training.simulation.drives import driven
@@ -28,7 +29,7 @@ OWN = (
     [unseen_plan(k) for k in range(3)]
     + [large_plan(k) for k in range(3)]
     + [more_plan(k) for k in range(3)]
-    + [hard_plan(), lidar_16_plan(), lidar_os0_plan(), repeating_plan()]
+    + [hard_plan(), lidar_16_plan(), lidar_os0_plan(), repeating_plan(), vehicle_ahead_plan()]
     + [height_plan(height_m) for height_m in HEIGHTS_M]
 )
 
@@ -82,6 +83,15 @@ def test_the_survey_of_the_os0_differs_from_the_sparse_one_by_its_lidar_only():
     elevation_deg = np.rad2deg(np.arcsin(rays[:, 2]))
     np.testing.assert_allclose(np.diff(elevation_deg), -90 / 127, atol=1e-4)
     np.testing.assert_allclose(elevation_deg[[0, -1]], [45.0, -45.0], atol=1e-4)
+
+
+def test_a_vehicle_is_ahead_of_every_query_and_of_the_whole_survey():
+    """The map of the unseen city answers its queries too, so both have the same city."""
+    plan, other = vehicle_ahead_plan(), unseen_plan(0)
+    assert plan.survey_parameters.followed == 1.0
+    assert {query.followed for query in plan.queries} == {1.0}
+    changed = {"name", "survey_parameters", "queries"}
+    assert plan.model_dump(exclude=changed) == other.model_dump(exclude=changed)
 
 
 def test_the_repeating_street_has_room_for_its_sequences():
