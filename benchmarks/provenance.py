@@ -99,6 +99,7 @@ _OF_CALIBRATED = (
 MEASURED: dict[str, dict[str, tuple[str, ...]]] = {
     "accuracy": {
         "": (*_CORE, *_DATA),
+        "filter.carried.": (*_CORE, *_DATA, "service/runtime/seal.py"),
         "real.": (*_CORE, "model_training/importing", "model_training/datasets", "model_training/mapping"),
         "rig.": (*_CORE, *_DATA, "model_training/calibration"),
         "rigs.": (*_CORE, *_DATA, "model_training/calibration"),
@@ -188,7 +189,6 @@ CITY_ARCHIVES = (
 NOT_RUN: dict[str, tuple[str, ...]] = {
     "accuracy": (
         *TILED_AND_STORED,
-        "service/localization/track_bytes.py",
         "model_training/datasets/stored_survey.py",
         "model_training/datasets/survey_part.py",
         *_TILED_BUILDS,
@@ -218,6 +218,7 @@ _OF_BAGS = ("import.", "roundtrip.bag.", "roundtrip.mcap.")
 ONLY_RUN_BY: dict[str, dict[str, tuple[str, ...]]] = {
     "accuracy": {
         "service/localization/tracker.py": ("filter.",),
+        "service/localization/track_bytes.py": ("filter.carried.",),
         "service/maps/inverted_file.py": (),
         **dict.fromkeys(_UPDATE, ("survey.two_passes_",)),
         **dict.fromkeys((*BAG_IMPORT, *OPTIONS_OF_IMPORTS), ()),

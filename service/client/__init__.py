@@ -7,7 +7,15 @@ from typing import TYPE_CHECKING, Any
 
 from service.client.async_client import AsyncClient
 from service.client.client import Client
-from service.client.prepare import Frame, RequestOptions, SequenceOptions, StreamFrame, StreamOptions, Track
+from service.client.prepare import (
+    BatchOptions,
+    Frame,
+    RequestOptions,
+    SequenceOptions,
+    StreamFrame,
+    StreamOptions,
+    Track,
+)
 from service.client.retry import RetryPolicy
 from service.client.stream_answer import StreamAnswer
 from service.contract.schema import (
@@ -40,6 +48,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "AsyncClient",
+    "BatchOptions",
     "Client",
     "ForeignServiceError",
     "Frame",

@@ -12,7 +12,7 @@ import httpx
 
 from service.client import prepare, rest
 from service.client.encode import JPEG_QUALITY, Packing
-from service.client.prepare import Camera, Depth, Frame, RequestOptions, Rgb, SequenceOptions
+from service.client.prepare import BatchOptions, Camera, Depth, Frame, RequestOptions, Rgb, SequenceOptions
 from service.client.retry import Attempts, RetryPolicy
 from service.client.tls import ClientTls
 from service.contract.schema import LocalizeAnswer, MapEntry
@@ -93,13 +93,13 @@ class AsyncClient:
         return await self.call(rest.localize_sequence(prepared))
 
     async def localize_batch(
-        self, frames: Sequence[Frame], **about: Unpack[SequenceOptions]
+        self, frames: Sequence[Frame], **about: Unpack[BatchOptions]
     ) -> list[LocalizeAnswer | RefusedError]:
         """Localize a batch of independent queries, as ``Client.localize_batch`` does.
 
         Args:
             frames: the queries. ``T_reference_camera`` must be None.
-            **about: optional data for every query; see ``SequenceOptions``.
+            **about: optional data for every query; see ``BatchOptions``.
         """
         prepared = await asyncio.to_thread(prepare.several, frames, about, self._packing)
         return await self.call(rest.localize_batch(prepared))

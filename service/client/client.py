@@ -11,7 +11,7 @@ import httpx
 
 from service.client import prepare, rest
 from service.client.encode import JPEG_QUALITY, Packing
-from service.client.prepare import Camera, Depth, Frame, RequestOptions, Rgb, SequenceOptions
+from service.client.prepare import BatchOptions, Camera, Depth, Frame, RequestOptions, Rgb, SequenceOptions
 from service.client.retry import Attempts, RetryPolicy
 from service.client.tls import ClientTls
 from service.contract.schema import LocalizeAnswer, MapEntry
@@ -121,13 +121,13 @@ class Client:
         return self.call(rest.localize_sequence(prepare.sequence(frames, about, self._packing)))
 
     def localize_batch(
-        self, frames: Sequence[Frame], **about: Unpack[SequenceOptions]
+        self, frames: Sequence[Frame], **about: Unpack[BatchOptions]
     ) -> list[LocalizeAnswer | RefusedError]:
         """Localize a batch of independent queries.
 
         Args:
             frames: the queries. ``T_reference_camera`` must be None.
-            **about: optional data for every query; see ``SequenceOptions``.
+            **about: optional data for every query; see ``BatchOptions``.
 
         Returns:
             One entry per query in the same order: the answer, or the error with which the service refused this query.

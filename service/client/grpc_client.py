@@ -16,6 +16,7 @@ from service.client.encode import JPEG_QUALITY, Packing
 from service.client.epochs import Epochs
 from service.client.grpc_errors import errors_of_grpc, refused_in_batch
 from service.client.prepare import (
+    BatchOptions,
     Camera,
     Depth,
     Frame,
@@ -162,20 +163,18 @@ class GrpcClient:
             **about: optional data; see ``SequenceOptions``.
         """
         prepared = prepare.sequence(frames, about, self._packing)
-        cell, message = (
-            cell_of(prepared.document.prior, prepared.document.map),
-            grpc_messages.sequence_message(prepared),
-        )
+        cell = cell_of(prepared.document.prior, prepared.document.map, prepared.before)
+        message = grpc_messages.sequence_message(prepared)
         return self._call(self._stub.LocalizeSequence, message, lambda got: grpc_messages.answer_of(got.answer), cell)
 
     def localize_batch(
-        self, frames: Sequence[Frame], **about: Unpack[SequenceOptions]
+        self, frames: Sequence[Frame], **about: Unpack[BatchOptions]
     ) -> list[LocalizeAnswer | RefusedError]:
         """Localize a batch of independent queries, as ``Client.localize_batch`` does.
 
         Args:
             frames: the queries. ``T_reference_camera`` must be None.
-            **about: optional data for every query; see ``SequenceOptions``.
+            **about: optional data for every query; see ``BatchOptions``.
         """
         prepared = prepare.several(frames, about, self._packing)
         first, message = prepared.document.requests[0], grpc_messages.batch_message(prepared)

@@ -61,6 +61,7 @@ def sequence_message(prepared: PreparedRequest[schema.SequenceRequest]) -> pb.Lo
         prior=_prior(request.prior),
         options=_options(request.options),
         vehicle_base_on_ground=request.vehicle_base_on_ground,
+        track=None if request.track is None else _track(request.track),
     )
 
 

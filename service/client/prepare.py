@@ -76,10 +76,8 @@ class RequestOptions(TypedDict, total=False):
     track: Track | None
 
 
-class SequenceOptions(TypedDict, total=False):
-    """Optional data of a sequence or a batch, as in ``RequestOptions``.
-
-    In a sequence ``T_vehicle_camera`` and ``prior`` describe the camera of the first frame.
+class BatchOptions(TypedDict, total=False):
+    """Optional data of every query of a batch, as in ``RequestOptions``.
 
     Attributes:
         map: name of the map.
@@ -94,6 +92,18 @@ class SequenceOptions(TypedDict, total=False):
     prior: schema.Prior | None
     options: schema.Options | None
     vehicle_base_on_ground: bool
+
+
+class SequenceOptions(BatchOptions, total=False):
+    """Optional data of a sequence, as in ``RequestOptions``.
+
+    ``T_vehicle_camera``, ``prior`` and the odometry of ``track`` describe the camera of the first frame.
+
+    Attributes:
+        track: state of a moving robot. The frames are those of its cameras at one moment.
+    """
+
+    track: Track | None
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
@@ -217,7 +227,7 @@ def one(
     return PreparedRequest(document, (pictures,), None if track is None else track.before)
 
 
-def several(frames: Sequence[Frame], about: SequenceOptions, packing: Packing) -> PreparedRequest[schema.BatchRequest]:
+def several(frames: Sequence[Frame], about: BatchOptions, packing: Packing) -> PreparedRequest[schema.BatchRequest]:
     """Build the request for a batch of independent queries.
 
     Args:
@@ -229,7 +239,7 @@ def several(frames: Sequence[Frame], about: SequenceOptions, packing: Packing) -
         RequestError: as ``one``, or a frame has a ``T_reference_camera``.
         TypeError: ``about`` has an unknown key.
     """
-    _only_known(about, SequenceOptions)
+    _only_known(about, BatchOptions)
     for number, frame in enumerate(frames):
         if frame.T_reference_camera is not None:
             raise RequestError(
@@ -262,8 +272,10 @@ def sequence(
         each | {"T_reference_camera": _transform(frame.T_reference_camera, f"frames.{number}.T_reference_camera")}
         for number, (frame, (each, _)) in enumerate(zip(frames, said, strict=True))
     ]
-    document = _checked(lambda: schema.SequenceRequest.model_validate({"frames": content} | _of_all(about)))
-    return PreparedRequest(document, tuple(pictures for _, pictures in said))
+    track = about.get("track")
+    told = {"frames": content} | _of_all(about) | _track(track)
+    document = _checked(lambda: schema.SequenceRequest.model_validate(told))
+    return PreparedRequest(document, tuple(pictures for _, pictures in said), None if track is None else track.before)
 
 
 def stream_frame(
@@ -302,7 +314,7 @@ def stream_frame(
         "T_previous_camera": _transform(frame.T_previous_camera, f"{where}T_previous_camera"),
         "odometry_std": frame.odometry_std,
     }
-    content = said | _of_all(SequenceOptions(**about, prior=frame.prior)) | {"track": odometry}
+    content = said | _of_all(BatchOptions(**about, prior=frame.prior)) | {"track": odometry}
     try:
         document = _checked(lambda: schema.LocalizeRequest.model_validate(content))
     except RequestError as error:
@@ -366,7 +378,7 @@ def _file(data: bytes, field: str) -> bytes:
     return data
 
 
-def _of_all(about: RequestOptions | SequenceOptions) -> dict[str, Any]:
+def _of_all(about: RequestOptions | BatchOptions) -> dict[str, Any]:
     """Return the request fields that a single query and a sequence have in common.
 
     Raises:
@@ -475,7 +487,7 @@ def _transform(T: NDArray[Any] | None, field: str) -> dict[str, Any] | None:
     return {"position": position, "orientation": {"x": x, "y": y, "z": z, "w": w}}
 
 
-def _only_known(about: RequestOptions | SequenceOptions | StreamOptions, known: type) -> None:
+def _only_known(about: RequestOptions | BatchOptions | StreamOptions, known: type) -> None:
     if unknown := sorted(set(about) - set(known.__annotations__)):
         raise TypeError(f"unknown argument {unknown[0]!r}; pass one of {', '.join(known.__annotations__)}")
 

@@ -103,7 +103,7 @@ def localize_sequence(prepared: PreparedRequest[schema.SequenceRequest]) -> Call
         "/v1/localize/sequence",
         schema.LocalizeAnswer.model_validate_json,
         _numbered(prepared),
-        {HEADER: cell_of(prepared.document.prior, prepared.document.map)},
+        {HEADER: cell_of(prepared.document.prior, prepared.document.map, prepared.before)},
     )
 
 

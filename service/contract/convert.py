@@ -193,6 +193,8 @@ def sequence_from(
         if query.camera_height is None and T_vehicle_reference is not None:
             query = replace(query, camera_height=_height_on_same_ground(T_vehicle_reference, transforms[-1]))
         queries.append(query)
+    if request.track is not None:
+        queries[0] = replace(queries[0], track=_track(request.track))
     return tuple(queries), tuple(transforms)
 
 

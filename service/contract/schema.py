@@ -370,7 +370,8 @@ class LocalizeRequest(_Strict):
     prior: Prior | None = Field(None, description="prior of the camera pose: a position, a heading, or both")
     options: Options = Options()
     track: Track | None = Field(
-        None, description="state of a moving robot that the client carries. A sequence and a gRPC stream have none"
+        None,
+        description="state of a moving robot that the client carries. A gRPC stream has none, because it keeps the track",
     )
 
 
@@ -445,6 +446,11 @@ class SequenceRequest(_Strict):
     )
     prior: Prior | None = Field(None, description="prior of the pose of the first frame's camera")
     options: Options = Options()
+    track: Track | None = Field(
+        None,
+        description="state of a moving robot that the client carries. The frames are those of its cameras at one moment, and the "
+        "odometry is that of the first frame's camera",
+    )
 
 
 class Street(BaseModel):

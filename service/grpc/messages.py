@@ -78,7 +78,8 @@ def sequence_request_from(message: pb.LocalizeSequenceRequest) -> schema.Sequenc
         _of_pair(frame) | _sub(frame, "reference_from_camera", "T_reference_camera", transform_content)
         for frame in message.frames
     ]
-    return checked(_of_all(message) | {"frames": frames}, schema.SequenceRequest)
+    content = _of_all(message) | {"frames": frames} | _sub(message, "track", "track", _track)
+    return checked(content, schema.SequenceRequest)
 
 
 def transform_from(message: pb.RigidTransform) -> schema.RigidTransform:

@@ -52,10 +52,12 @@ def follow(
     track: Track,
     T_previous_camera: Transform | None,
     odometry_std: OdometryStd | None = None,
+    *,
+    beside: tuple[EncodedFrame, ...] = (),
 ) -> tuple[Answer, Track]:
     """Answer the next frame of a robot.
 
-    1. The frame is registered alone. The modes of the belief are starts too.
+    1. The frame is registered without the frames before. The modes of the belief are starts too.
     2. The odometry moves the belief. The frame updates it.
     3. If another mode overtakes the one that the robot was at, the robot was displaced. The frames before no longer count.
     4. The answer comes from the frame alone, from the last frames together, or from the belief: the first that is LOCALIZED and that
@@ -68,6 +70,8 @@ def follow(
         T_previous_camera: odometry, from this camera's frame to the previous camera's frame, metres. None: unknown; the track begins
             again.
         odometry_std: standard deviations of the odometry. None: they follow from the size of the motion.
+        beside: frames of the other cameras of a rig at the same moment, with their poses relative to ``frame``. They are registered
+            together with it. Frames before are then not registered again, because a rig sees in many directions already.
 
     Returns:
         The answer with its ``belief`` and ``epoch``, and the track for the next frame.
@@ -87,19 +91,21 @@ def follow(
         last = None if track.last is None else moved(track.last, T_previous_camera, odometry_std)
     if belief.born and frame.query.prior is not None:  # a prior counts once, in the first frame of a track
         frame = replace(frame, query=replace(frame.query, prior=None))
+    newest, kept = (frame, *beside), () if beside else kept
     bundle = localizer.bundle
     is_calibrated = bundle.cloud is not None and bundle.calibration is not None
     if not frame.query.refine or not is_calibrated:  # the frame has no probability
-        following = Track(belief.unseen(), track.epoch, last, _window(frame, kept))
-        answer = localizer.answer((frame, *_apart(kept)))
+        following = Track(belief.unseen(), track.epoch, last, _window(newest, kept))
+        answer = localizer.answer((*newest, *_apart(kept)))
         return replace(answer, belief=following.belief, epoch=track.epoch) if is_calibrated else answer, following
     predicted = tuple(mode.T_map_camera for mode in belief.modes[:PREDICTED])
-    alone = localizer.register((frame,), predicted)
+    alone = localizer.register(newest, predicted)
     with stage("register"):
-        belief = updated_belief(bundle.calibration, frame, alone, belief)
+        calibration = calibration_for(bundle.calibration, (each.query for each in newest))
+        belief = updated_belief(calibration, frame, alone, belief)
     if _is_overtaken(last, belief):
         kept = ()
-    answer = _answer(localizer, (frame, *_apart(kept)), alone, belief)
+    answer = _answer(localizer, newest, _apart(kept), alone, belief)
     epoch = track.epoch
     if answer.status == "LOCALIZED" and answer.candidates and answer.covariance is not None:
         found = frame_candidate_of(answer.candidates[0], answer.covariance, probability=answer.confidence or 0.0)
@@ -108,13 +114,18 @@ def follow(
         last = Mode(found.T_map_camera, found.covariance, found.probability, 0, found.inliers, found.similarity)
     answer = replace(answer, belief=belief, epoch=epoch)
     require_finite(answer)
-    return answer, Track(belief, epoch, last, _window(frame, kept))
+    return answer, Track(belief, epoch, last, _window(newest, kept))
 
 
-def _window(frame: EncodedFrame, kept: tuple[EncodedFrame, ...]) -> tuple[EncodedFrame, ...]:
-    """Return the frames to keep for the next one. A frame near the last kept one shows the same picture, so it is not kept."""
+def _window(newest: tuple[EncodedFrame, ...], kept: tuple[EncodedFrame, ...]) -> tuple[EncodedFrame, ...]:
+    """Return the frames to keep for the next one: none of a rig of several cameras.
+
+    A frame near the last kept one shows the same picture, so it is not kept.
+    """
+    if len(newest) > 1:
+        return ()
     is_new = not kept or _is_apart(kept[0])
-    return ((frame, *kept) if is_new else kept)[: MOST_FRAMES - 1]
+    return ((*newest, *kept) if is_new else kept)[: MOST_FRAMES - 1]
 
 
 def _apart(kept: tuple[EncodedFrame, ...]) -> tuple[EncodedFrame, ...]:
@@ -135,25 +146,32 @@ def _is_overtaken(last: Mode | None, belief: Belief) -> bool:
     return not agrees(last, first.T_map_camera) and first.weight > max(belief.elsewhere, belief.outside)
 
 
-def _answer(localizer: Localizer, frames: tuple[EncodedFrame, ...], alone: QueryResult, belief: Belief) -> Answer:
-    """Build the answer from the frame alone, else from all frames together, else from the belief: the first that is accepted."""
+def _answer(
+    localizer: Localizer,
+    newest: tuple[EncodedFrame, ...],
+    before: tuple[EncodedFrame, ...],
+    alone: QueryResult,
+    belief: Belief,
+) -> Answer:
+    """Build the answer from the newest frame, else from all frames together, else from the belief: the first that is accepted."""
     ceiling = partial(_ceiling, alone=alone, belief=belief)
     if _is_localized(alone) and ceiling(alone) > CONTRADICTED:
-        return localizer.compose(frames[:1], alone)
-    found, used = alone, frames[:1]
-    if len(frames) > 1:
-        found, used = localizer.register(frames), frames
+        return localizer.compose(newest, alone)
+    found, used = alone, newest
+    if before:
+        used = (*newest, *before)
+        found = localizer.register(used)
         if _is_localized(found) and ceiling(found) > CONTRADICTED:
-            return localizer.compose(frames, found)
+            return localizer.compose(used, found)
     calibration = calibration_for(localizer.bundle.calibration, (frame.query for frame in used))
-    accepted = None if calibration is None else agreed(calibration, belief, frames[0].query.false_accept_rate)
+    accepted = None if calibration is None else agreed(calibration, belief, newest[0].query.false_accept_rate)
     if calibration is not None and accepted is not None and alone.refined is not None:
         first, best = belief.modes[0], None if found.refined is None else found.refined.best
-        if best is not None and agrees(first, best.T_map_camera) and is_likely(calibration, frames[0], found):
+        if best is not None and agrees(first, best.T_map_camera) and is_likely(calibration, newest[0], found):
             # The pose of all frames is more accurate than that of the newest one.
             return localizer.compose(used, replace(found, decision=accepted))
         refined = alone.refined.with_best(first.T_map_camera)
-        return localizer.compose(frames[:1], replace(alone, refined=refined, decision=accepted))
+        return localizer.compose(newest, replace(alone, refined=refined, decision=accepted))
     if found.decision is not None and found.decision.status == "LOCALIZED":
         doubted = Decision("AMBIGUOUS", min(found.decision.confidence, ceiling(found)), found.decision.known)
         found = replace(found, decision=doubted)

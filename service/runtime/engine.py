@@ -48,6 +48,9 @@ from service.runtime.tile_metrics import TileMetrics
 from service.runtime.tracing import Tracing
 from service.timing import stage, timed_request
 
+#: Pose of the reference in its own frame.
+_HERE = np.eye(4)
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CarriedTrack:
@@ -216,25 +219,39 @@ class Engine:
             UnsupportedFormatError: the format of an image is not supported.
             TooLargeError: an image exceeds the limits.
         """
-        if encoded.track is not None:
-            return self._continued(encoded, encoded.track)
-        return self.localize_sequence((encoded,), (np.eye(4),))
+        return self.localize_sequence((encoded,), (_HERE,))
 
-    @timed_request()
     def localize_sequence(
         self, encoded: tuple[EncodedQuery, ...], T_reference_camera: tuple[NDArray[np.float64], ...]
     ) -> Located:
         """Decode several image pairs and localize them as one, in the thread of the caller.
 
         Args:
-            encoded: the image pairs, the reference first; its map is queried.
+            encoded: the image pairs, the reference first; its map is queried, and its track continues.
             T_reference_camera: for each pair, from its camera frame to the reference camera frame, (4, 4), metres. The first is
                 the identity.
 
         Raises:
             StreetfixError: as for ``localize``; with several pairs its field is under ``frames.K``.
         """
+        if encoded[0].track is not None:
+            return self._continued(encoded, T_reference_camera, encoded[0].track)
+        return self._without_track(encoded, T_reference_camera)
+
+    @timed_request()
+    def _without_track(
+        self, encoded: tuple[EncodedQuery, ...], T_reference_camera: tuple[NDArray[np.float64], ...]
+    ) -> Located:
         localizer = self.localizer_for(encoded[0])
+        return self.answer(localizer, self._frames(localizer, encoded, T_reference_camera))
+
+    def _frames(
+        self,
+        localizer: Localizer,
+        encoded: tuple[EncodedQuery, ...],
+        T_reference_camera: tuple[NDArray[np.float64], ...],
+    ) -> tuple[EncodedFrame, ...]:
+        """Decode and look up image pairs. The field of an error is under ``frames.K`` if there are several."""
         frames = []
         for number, (each, T) in enumerate(zip(encoded, T_reference_camera, strict=True)):
             try:
@@ -244,7 +261,7 @@ class Engine:
                     error.field = f"frames.{number}.{error.field}" if error.field else f"frames.{number}"
                 raise
             frames.append(replace(frame, T_reference_camera=T))
-        return self.answer(localizer, tuple(frames))
+        return tuple(frames)
 
     def answer(self, localizer: Localizer, frames: tuple[EncodedFrame, ...]) -> Located:
         """Answer frames that were looked up, and count the answer in the metrics.
@@ -259,25 +276,27 @@ class Engine:
     def follow(
         self,
         localizer: Localizer,
-        encoded: EncodedQuery,
+        encoded: tuple[EncodedQuery, ...],
         track: Track,
         T_previous_camera: NDArray[np.float64] | None,
         odometry_std: OdometryStd | None = None,
+        T_reference_camera: tuple[NDArray[np.float64], ...] = (_HERE,),
     ) -> tuple[Located, Track]:
         """Decode and answer the next frame of a robot, and count the answer in the metrics.
 
         Args:
             localizer: of the map.
-            encoded: the frame.
+            encoded: the image pairs of this moment: one, or those of the cameras of a rig with the reference first.
             track: of the frames before.
             T_previous_camera: odometry, from this camera's frame to the previous camera's frame, metres; None if it is unknown.
             odometry_std: standard deviations of the odometry; None if they are unknown.
+            T_reference_camera: for each pair, as in ``localize_sequence``.
 
         Raises:
-            StreetfixError: as for ``localize``.
+            StreetfixError: as for ``localize_sequence``.
         """
-        frame = self.encode_and_search(localizer, encoded)
-        answer, following = follow(localizer, frame, track, T_previous_camera, odometry_std)
+        frame, *beside = self._frames(localizer, encoded, T_reference_camera)
+        answer, following = follow(localizer, frame, track, T_previous_camera, odometry_std, beside=tuple(beside))
         expect_next(localizer.bundle, following, T_previous_camera)
         if following.epoch != track.epoch:
             self.metrics.disrupted(localizer.bundle)
@@ -289,13 +308,18 @@ class Engine:
             self.last_answers.add(answer, localizer.bundle, frames=answer.frames)
         return Located(answer, localizer.bundle)
 
-    def _continued(self, encoded: EncodedQuery, carried: CarriedTrack) -> Located:
+    def _continued(
+        self,
+        encoded: tuple[EncodedQuery, ...],
+        T_reference_camera: tuple[NDArray[np.float64], ...],
+        carried: CarriedTrack,
+    ) -> Located:
         """Answer a query whose client carries the belief.
 
         Raises:
             RequestError: the belief was not sealed by this service.
         """
-        localizer = self.localizer_for(encoded)
+        localizer = self.localizer_for(encoded[0])
         version = f"{localizer.bundle.name}@{localizer.bundle.manifest.version}"
         track = Track()
         if carried.sealed_belief is not None:
@@ -307,7 +331,9 @@ class Engine:
                     field="track.belief",
                 )
             track = unpacked(content, map_version=version)
-        located, following = self.follow(localizer, encoded, track, carried.T_previous_camera, carried.odometry_std)
+        located, following = self.follow(
+            localizer, encoded, track, carried.T_previous_camera, carried.odometry_std, T_reference_camera
+        )
         if located.answer.belief is None:
             return located
         content = packed(following, map_version=version)

@@ -52,7 +52,7 @@ class Stream:
             localizer is not last
         ):  # the first frame, or another map version serves now: the poses before refer to the old one
             before = before.broken()
-        located, self._track = self._engine.follow(localizer, encoded, before, T_previous_camera, odometry_std)
+        located, self._track = self._engine.follow(localizer, (encoded,), before, T_previous_camera, odometry_std)
         return located, located.answer.frames
 
     def forget(self) -> None:

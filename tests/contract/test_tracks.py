@@ -356,16 +356,13 @@ def forged(belief: Any) -> Any:
     return belief.model_copy(update={"token": "A" * 100})
 
 
-def test_a_batch_may_carry_tracks_and_a_sequence_may_not(faces: Any, parts_of: Parts) -> None:
+def test_a_batch_may_carry_tracks(faces: Any, parts_of: Parts) -> None:
     client, _, _ = faces
     parts = parts_of(track={})
     request = json.loads(parts["request"])
     pictures = {f"{name}0": (name, parts[name]) for name in ("rgb", "depth")}
     batch = client.post("/v1/localize/batch", files=pictures | {"request": ("r", json.dumps({"requests": [request]}))})
     assert batch.json()["outcomes"][0]["answer"]["belief"]["token"]
-    sequence = {"frames": [{name: request[name] for name in ("camera", "depth")}], "track": {}}
-    refused = client.post("/v1/localize/sequence", files=pictures | {"request": ("r", json.dumps(sequence))})
-    assert (refused.status_code, refused.json()["field"]) == (422, "track")
 
 
 @pytest.mark.parametrize(

@@ -85,7 +85,7 @@ TRACK = {"track": {"belief": "AAAA", "T_previous_camera": T, "odometry_std": ODO
 ALONE = [HIGH | ABOUT | TRACK | {"prior": POSITION}, FRAME | ABOUT | ON_GROUND | {"prior": WGS84}]
 SEQUENCES = [
     ABOUT | {"frames": [frame, frame | {"T_reference_camera": T}]} | more
-    for frame, more in ((HIGH, {"prior": POSITION}), (FRAME, ON_GROUND | {"prior": WGS84}))
+    for frame, more in ((HIGH, TRACK | {"prior": POSITION}), (FRAME, ON_GROUND | {"prior": WGS84}))
 ]
 
 

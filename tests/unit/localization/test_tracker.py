@@ -119,6 +119,41 @@ def drive(localizer, frame, monkeypatch):
     return run
 
 
+class OfRig(Scripted):
+    """A localizer that registers the cameras of a rig together, and nothing else."""
+
+    def __init__(self, template: Any, moments: list[QueryResult]) -> None:
+        super().__init__(template, [])
+        self.moments = iter(moments)
+
+    def register(self, frames: tuple[EncodedFrame, ...], predicted: tuple[Any, ...] = ()) -> QueryResult:
+        assert len(frames) == 2
+        self.predicted.append(len(predicted))
+        return next(self.moments)
+
+
+def test_the_cameras_of_a_rig_are_one_observation_and_no_frame_before_is_registered_again(
+    localizer, frame, monkeypatch
+):
+    """As with one camera: 0.7, then 0.7 x 2 x 0.7 against 0.28 x 0.28 and 0.02 x 0.02."""
+    in_range(monkeypatch)
+    rig = OfRig(localizer.answer((frame,)), [found(0.7, (2.0 * k, 0.99)) for k in range(2)])
+    first, track = follow(rig, frame, Track(), None, beside=(frame,))
+    second, following = follow(rig, frame, track, AHEAD, beside=(frame,))
+    assert [(each.status, each.frames) for each in (first, second)] == [("AMBIGUOUS", 2), ("LOCALIZED", 2)]
+    assert (track.frames, following.frames, rig.predicted) == ((), (), [0, 1])
+    assert second.belief is not None
+    assert second.belief.modes[0].weight > THRESHOLD
+
+
+def test_after_a_rig_one_camera_has_no_frames_before(localizer, frame, monkeypatch):
+    in_range(monkeypatch)
+    template = localizer.answer((frame,))
+    _, track = follow(OfRig(template, [found(0.7, (0.0, 0.99))]), frame, Track(), None, beside=(frame,))
+    answer, track = follow(Scripted(template, [found(0.5, (2.0, 0.99))]), frame, track, AHEAD)
+    assert (answer.frames, len(track.frames)) == (1, 1)
+
+
 def test_a_sure_frame_needs_no_other(drive):
     sure = [found(0.97, (2.0 * k, 0.99)) for k in range(3)]
     assert drive(sure) == [(0.0, "LOCALIZED", 0, 1), (2.0, "LOCALIZED", 0, 1), (4.0, "LOCALIZED", 0, 1)]

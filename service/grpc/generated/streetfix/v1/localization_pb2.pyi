@@ -160,20 +160,22 @@ class Problem(_message.Message):
     def __init__(self, code: _Optional[str] = ..., title: _Optional[str] = ..., detail: _Optional[str] = ..., field: _Optional[str] = ...) -> None: ...
 
 class LocalizeSequenceRequest(_message.Message):
-    __slots__ = ("map", "frames", "vehicle_from_camera", "prior", "options", "vehicle_base_on_ground")
+    __slots__ = ("map", "frames", "vehicle_from_camera", "prior", "options", "vehicle_base_on_ground", "track")
     MAP_FIELD_NUMBER: _ClassVar[int]
     FRAMES_FIELD_NUMBER: _ClassVar[int]
     VEHICLE_FROM_CAMERA_FIELD_NUMBER: _ClassVar[int]
     PRIOR_FIELD_NUMBER: _ClassVar[int]
     OPTIONS_FIELD_NUMBER: _ClassVar[int]
     VEHICLE_BASE_ON_GROUND_FIELD_NUMBER: _ClassVar[int]
+    TRACK_FIELD_NUMBER: _ClassVar[int]
     map: str
     frames: _containers.RepeatedCompositeFieldContainer[SequenceFrame]
     vehicle_from_camera: RigidTransform
     prior: Prior
     options: Options
     vehicle_base_on_ground: bool
-    def __init__(self, map: _Optional[str] = ..., frames: _Optional[_Iterable[_Union[SequenceFrame, _Mapping]]] = ..., vehicle_from_camera: _Optional[_Union[RigidTransform, _Mapping]] = ..., prior: _Optional[_Union[Prior, _Mapping]] = ..., options: _Optional[_Union[Options, _Mapping]] = ..., vehicle_base_on_ground: _Optional[bool] = ...) -> None: ...
+    track: Track
+    def __init__(self, map: _Optional[str] = ..., frames: _Optional[_Iterable[_Union[SequenceFrame, _Mapping]]] = ..., vehicle_from_camera: _Optional[_Union[RigidTransform, _Mapping]] = ..., prior: _Optional[_Union[Prior, _Mapping]] = ..., options: _Optional[_Union[Options, _Mapping]] = ..., vehicle_base_on_ground: _Optional[bool] = ..., track: _Optional[_Union[Track, _Mapping]] = ...) -> None: ...
 
 class SequenceFrame(_message.Message):
     __slots__ = ("rgb", "depth", "camera", "depth_format", "gravity", "reference_from_camera")
