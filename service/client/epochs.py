@@ -20,8 +20,10 @@ class Epochs:
         Args:
             answer: as the service sent it.
         """
-        self._has_pose |= answer.pose is not None
+        epoch = self._last if answer.belief is None else self._before + answer.belief.epoch
+        # A higher epoch without a pose means that the track began again, so a lost connection now disrupts nothing.
+        self._has_pose = answer.pose is not None or (self._has_pose and epoch == self._last)
+        self._last = epoch
         if answer.belief is None:
             return answer
-        self._last = self._before + answer.belief.epoch
         return answer.model_copy(update={"belief": answer.belief.model_copy(update={"epoch": self._last})})

@@ -117,6 +117,7 @@ class GrpcClient:
         if credentials is None and (self._tls.is_wanted if tls is None else tls):
             credentials = grpc.ssl_channel_credentials(*self._tls.pems())
         self._speaks_tls = credentials is not None
+        self._is_closed = False
         self._channel = (
             grpc.insecure_channel(address, options=_OPTIONS)
             if credentials is None
@@ -135,7 +136,8 @@ class GrpcClient:
         self.close()
 
     def close(self) -> None:
-        """Close the channel."""
+        """Close the channel. Open streams end, and later calls raise ``RequestError``."""
+        self._is_closed = True
         self._channel.close()
 
     def localize(self, rgb: Rgb, depth: Depth, camera: Camera, **about: Unpack[RequestOptions]) -> LocalizeAnswer:
@@ -204,7 +206,7 @@ class GrpcClient:
             For each frame its answer, or the ``RefusedError`` of the service.
 
         Raises:
-            RequestError: a frame is invalid. ``field`` names it. The frames before have their answers.
+            RequestError: a frame is invalid (``field`` names it), or the client is closed. The frames before have their answers.
             RefusedError: the service ended the stream, for example because of a wrong API key.
             UnavailableError: the service still has no room after the last attempt.
             NoAnswerInTimeError: no answer to a frame within ``timeout_s``.
@@ -253,6 +255,7 @@ class GrpcClient:
                 call.cancel()
 
     def _open_stream(self, cell: str) -> StreamCall:
+        self._require_open()
         metadata = self._metadata_of(cell)
         return StreamCall(self._stub.LocalizeStream, metadata, address=self._address, timeout_s=self._timeout_s)
 
@@ -280,11 +283,18 @@ class GrpcClient:
         metadata = self._metadata_of(cell)
         while True:
             try:
+                self._require_open()
                 with self._errors():
                     return read(method(message, timeout=self._timeout_s, metadata=metadata))
             except StreetfixError as error:
                 wait_s = attempts.wait_after(error)
             self._sleep(wait_s)
+
+    def _require_open(self) -> None:
+        if self._is_closed:
+            raise RequestError(
+                "client: it is closed; make its calls, and read its streams, inside its with block", field="client"
+            )
 
     def _metadata_of(self, cell: str | None) -> tuple[tuple[str, str], ...]:
         return self._metadata if cell is None else (*self._metadata, (HEADER.lower(), cell))

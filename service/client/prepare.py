@@ -314,8 +314,8 @@ def stream_frame(
         "T_previous_camera": _transform(frame.T_previous_camera, f"{where}T_previous_camera"),
         "odometry_std": frame.odometry_std,
     }
-    content = said | _of_all(BatchOptions(**about, prior=frame.prior)) | {"track": odometry}
     try:
+        content = said | _of_all(BatchOptions(**about, prior=frame.prior)) | {"track": odometry}
         document = _checked(lambda: schema.LocalizeRequest.model_validate(content))
     except RequestError as error:
         raise RequestError(f"{where}{error.message}", field=f"{where}{error.field}") from error

@@ -19,6 +19,7 @@ from service.client import (
     PinholeCamera,
     Prior,
     PriorPosition,
+    PriorWgs84,
     RetryPolicy,
     StreamAnswer,
     StreamFrame,
@@ -49,6 +50,9 @@ from service.grpc.status import status_of
 RGB, DEPTH = np.full((4, 6, 3), 7, np.uint8), np.full((4, 6), 2.5, np.float32)
 CAMERA = PinholeCamera(6, 4, 3.0, 3.0, 2.5, 1.5)
 AHEAD = np.array([[1.0, 0, 0, 0], [0, 1.0, 0, 0], [0, 0, 1.0, 2.0], [0, 0, 0, 1.0]])
+TWO_POSITIONS = Prior(
+    position=PriorPosition(x=1.0, y=2.0, std_m=3.0), wgs84=PriorWgs84(latitude_deg=1.0, longitude_deg=2.0, std_m=3.0)
+)
 GONE = (grpc.StatusCode.UNAVAILABLE, "gone")
 SILENCE, END = object(), object()
 Json = Callable[..., dict[str, Any]]
@@ -320,6 +324,31 @@ def test_a_track_without_a_pose_keeps_its_epoch(client: GrpcClient, service: Scr
     assert epochs_of(client.localize_stream([frame(), frame()])) == [2, 2]
 
 
+def test_a_track_that_began_again_without_a_pose_keeps_its_epoch(
+    client: GrpcClient, service: Scripted, reply: Reply
+) -> None:
+    """The service counts the refused frame as a disruption. The track after it has no pose, so the lost connection is none."""
+    refused = pb.LocalizeStreamResponse(outcome=pb.Outcome(problem=pb.Problem(code="no-depth", title="T.", detail="D")))
+    service.begin([reply(0), refused, reply(1, localized=False), GONE], [reply(0), GONE], [reply(0)])
+    first, _, *others = client.localize_stream([frame()] * 5)
+    assert epochs_of([first, *others]) == [0, 1, 1, 2]
+
+
+@pytest.mark.parametrize("close_after", [0, 1])
+def test_a_closed_client_says_so(
+    served: tuple[Scripted, str], service: Scripted, reply: Reply, close_after: int
+) -> None:
+    service.begin([reply(), reply()])
+    client = GrpcClient(served[1], retry=RetryPolicy(backoff_s=0.0))
+    answers = client.localize_stream([frame()] * 2)
+    for _ in range(close_after):
+        next(answers)
+    client.close()
+    for call in (lambda: next(answers), client.maps):
+        with pytest.raises(RequestError, match="client: it is closed; make its calls"):
+            call()
+
+
 def test_the_limits_of_retries_hold_for_each_frame(
     client: GrpcClient, service: Scripted, waited_s: list[float], reply: Reply
 ) -> None:
@@ -393,6 +422,7 @@ def test_a_stream_of_another_contract_is_reported(
         ({"T_previous_camera": None, "odometry_std": OdometryStd(position_m=1, angle_deg=1)}, "frames.1.odometry_std"),
         ({"camera_height_std_m": 0.1}, "frames.1.camera_height_std_m"),
         ({"camera_height_m": 99.0}, "frames.1.camera.height_m"),
+        ({"prior": TWO_POSITIONS}, "frames.1.prior"),
     ],
 )
 def test_an_invalid_frame_ends_the_stream_and_is_named(
