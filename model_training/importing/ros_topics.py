@@ -95,7 +95,7 @@ def topics_of(available: list[Topic], given: Mapping[str, str], *, source: str, 
         stereo: the pairs of a stereo rig will be matched. Then no topic of depth is chosen.
 
     Raises:
-        DatasetError: a role or topic is unknown or of another type, or there is no point cloud.
+        DatasetError: a role or topic is unknown or of another type, a topic has two roles, or there is no point cloud.
     """
     by_name = {topic.name: topic for topic in available}
     for role, name in given.items():
@@ -109,6 +109,12 @@ def topics_of(available: list[Topic], given: Mapping[str, str], *, source: str, 
             raise DatasetError(
                 f"topic {name!r} is {by_name[name].msgtype}; for {role} the type must be one of: "
                 f"{', '.join(_TYPES[role])}",
+                field="topic",
+            )
+    for name in given.values():
+        if len(roles := [role for role in ROLES if given.get(role) == name]) > 1:
+            raise DatasetError(
+                f"topic {name!r} is given for {' and for '.join(roles)}; give each role a topic of its own",
                 field="topic",
             )
     chosen = {role: by_name[name] for role, name in given.items()}

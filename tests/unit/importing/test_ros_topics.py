@@ -110,3 +110,17 @@ def test_a_topic_that_does_not_fit_is_refused_with_those_there_are(told, why):
 def test_a_bag_without_a_point_cloud_says_what_it_has():
     with pytest.raises(DatasetError, match=r"no sensor_msgs/PointCloud2.*it has: /a \(sensor_msgs/msg/Image\)"):
         topics_of([image("/a")], {}, source="drive.mcap")
+
+
+@pytest.mark.parametrize(
+    ("told", "roles"),
+    [
+        ({"color": "/left/image", "right": "/left/image"}, "color and for right"),
+        ({"info": "/left/info", "right_info": "/left/info"}, "info and for right_info"),
+    ],
+)
+def test_a_topic_has_one_role(told, roles):
+    available = [SCAN, image("/left/image"), image("/right/image"), info("/left/info")]
+    with pytest.raises(DatasetError, match=f"is given for {roles}; give each role a topic of its own") as caught:
+        topics_of(available, told, source="drive.mcap", stereo=True)
+    assert caught.value.field == "topic"
