@@ -17,6 +17,7 @@ from service.bridge.pictures import is_rectified_by_name
 from service.errors import DatasetError, RequestError
 from service.geometry.camera import PinholeCamera
 from service.geometry.rigid import Transform
+from service.option_limits import LEAST_BASELINE_M, MOST_BASELINE_M
 
 _TF = POSE_TYPES[-1]
 
@@ -33,8 +34,8 @@ class BagSettings:
         want_pictures: False needs neither intrinsics nor the camera's mounting.
         want_depth: False pairs no depth with colour.
         stereo: match left and right images. The topic of depth is not used then.
-        baseline_m: of the stereo rig that measured the depth or whose pairs are matched, metres; None if it is not known or in the
-            topic ``right_info``.
+        baseline_m: of the stereo rig that measured the depth or whose pairs are matched, metres. It goes before the topic
+            ``right_info``. None if it is not known or in this topic.
         max_points: a larger scan is refused.
     """
 
@@ -148,11 +149,10 @@ def _rig(
             field="right_info",
         )
     infos = [None if topic is None else bag.first(topic.name) for topic in (topics.info, topics.right_info)]
+    if settings.baseline_m is None and infos[0] is not None:
+        # The right camera's P counts from the origin of the rig, which need not be the left camera.
+        baseline_m = _from_left(baseline_m + offset_m(infos[0]), source=bag.name)
     left, right = infos if settings.camera is None else (None, None)
-    if left is not None and right is not None:
-        baseline_m += offset_m(
-            left
-        )  # the right camera's P counts from the origin of the rig, which need not be the left camera
     if is_rectified(topics, settings):
         if left is not None and right is not None:
             require_same_projection(left, right, source=bag.name)
@@ -184,13 +184,25 @@ def is_rectified(topics: Topics, settings: BagSettings) -> bool:
 
 
 def _baseline(bag: BagReader, topics: Topics, settings: BagSettings) -> float | None:
-    """Baseline as given, or from the calibration of the right camera, metres; None if neither is given."""
-    if topics.right_info is None:
+    """Baseline as given, or from the calibration of the right camera, metres; None if there is neither. A given one counts first."""
+    if settings.baseline_m is not None or topics.right_info is None:
         return settings.baseline_m
     try:
         return baseline_of(bag.first(topics.right_info.name), topics.right_info.name)
     except RequestError as error:
         raise DatasetError(f"{bag.name}, topic {error.message}", field="right_info") from error
+
+
+def _from_left(baseline_m: float, *, source: str) -> float:
+    """Refuse a baseline that no pair of a left and a right camera has."""
+    if not LEAST_BASELINE_M <= baseline_m <= MOST_BASELINE_M:
+        raise DatasetError(
+            f"{source}: P[0, 3] of both CameraInfos means a baseline of {baseline_m:g} m from the left to the right camera, outside "
+            f"{LEAST_BASELINE_M:g} to {MOST_BASELINE_M:g} m; if the cameras are swapped, give --topic color=LEFT --topic right=RIGHT "
+            "--topic info=LEFT_INFO --topic right_info=RIGHT_INFO, otherwise give --baseline-m METRES",
+            field="right_info",
+        )
+    return baseline_m
 
 
 def _poses(bag: BagReader, topics: Topics, remarks: list[str]) -> tuple[FrameTree, Trajectory | None, str]:

@@ -27,6 +27,8 @@ Lookup = Float32[NDArray[np.float32], "2 H W"]
 STEREO_TOLERANCE_S = 0.005
 #: Greatest difference of fx, cx and cy of two rectified cameras, pixels. A larger one would shift every disparity.
 _MOST_DIFFERENCE_PX = 0.5
+#: Numbers of coefficients of a lens, and the number of a fisheye lens, that OpenCV rectifies.
+_OF_LENS, _OF_FISHEYE = (4, 5, 8, 12, 14), 4
 
 
 @dataclass(frozen=True, slots=True)
@@ -105,8 +107,15 @@ def lookups_of(left: Any, right: Any, *, source: str) -> tuple[Lookup, Lookup]:
         source: name of the bag, for errors.
 
     Raises:
-        DatasetError: a camera is not calibrated as part of a stereo rig.
+        DatasetError: a camera is not calibrated as part of a stereo rig, or the sizes of both differ.
     """
+    of_left, of_right = ((int(each.width), int(each.height)) for each in (left, right))
+    if of_left != of_right or min(of_left) < 1:
+        raise DatasetError(
+            f"{source}: the CameraInfos say that the left images have {of_left[0]}x{of_left[1]} pixels and the right ones "
+            f"{of_right[0]}x{of_right[1]}; give the CameraInfos of two cameras of one size, or record rectified images",
+            field="right_info",
+        )
     projection = _matrix(left, "p", (3, 4))[:, :3]
     return _lookup(left, projection, f"{source}, left camera"), _lookup(right, projection, f"{source}, right camera")
 
@@ -170,6 +179,8 @@ def spread_pairs(bag: BagReader, color: str, right: str) -> Iterator[Pair]:
                     seen.add(pairs[0].stamp_s)
                     yield pairs[0]
                 break
+        else:  # no pair follows, so a later begin finds none either
+            return
 
 
 def _looked_up(image: Rgb, lookup: Lookup) -> Rgb:
@@ -196,8 +207,16 @@ def _lookup(message: Any, projection: NDArray[np.float64], named: str) -> Lookup
             field="info",
         )
     size = (int(message.width), int(message.height))
-    if lens == "kannala_brandt" and D.size:
-        columns, rows = cv2.fisheye.initUndistortRectifyMap(K, D[:4], R, projection, size, cv2.CV_32FC1)
+    is_fisheye = lens == "kannala_brandt" and D.size > 0
+    if (is_fisheye and D.size < _OF_FISHEYE) or (not is_fisheye and D.any() and D.size not in _OF_LENS):
+        wanted = f"{_OF_FISHEYE} or more" if is_fisheye else ", ".join(map(str, _OF_LENS))
+        raise DatasetError(
+            f"{named}: distortion_model {message.distortion_model[:40]!r} has {D.size} coefficients (valid: {wanted}); calibrate the "
+            "camera, or record rectified images",
+            field="info",
+        )
+    if is_fisheye:
+        columns, rows = cv2.fisheye.initUndistortRectifyMap(K, D[:_OF_FISHEYE], R, projection, size, cv2.CV_32FC1)
     else:
         columns, rows = cv2.initUndistortRectifyMap(K, D if D.any() else np.zeros(5), R, projection, size, cv2.CV_32FC1)
     lookup: Lookup = np.stack([columns, rows]).astype(np.float32)

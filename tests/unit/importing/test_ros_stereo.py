@@ -179,6 +179,54 @@ def test_without_a_right_calibration_the_baseline_can_be_given_if_the_images_are
         opened(path, baseline_m=0.32, rectified=False)
 
 
+def test_a_given_baseline_goes_before_a_guessed_calibration(ros, tmp_path):
+    """The left camera is not the origin of this rig. A given baseline is that of the cameras, so nothing is added to it."""
+    infos = (info_of(ros, baseline_m=-0.06), info_of(ros, baseline_m=BASELINE_M - 0.06))
+    bag = opened(ros.write(tmp_path / "bag", drive(ros, count=1, infos=infos)), baseline_m=0.32)
+    (found,) = pictures(bag)
+    assert found.baseline_m == 0.32
+    assert np.median(found.depth[INNER]) == pytest.approx(2 * DEPTH_M, abs=0.04)
+
+
+def test_a_given_camera_keeps_the_baseline_from_the_left_camera(ros, tmp_path):
+    infos = (info_of(ros, baseline_m=-0.06), info_of(ros, baseline_m=BASELINE_M - 0.06))
+    camera = PinholeCamera(WIDTH, HEIGHT, FOCAL, FOCAL, (WIDTH - 1) / 2, (HEIGHT - 1) / 2)
+    (found,) = pictures(opened(ros.write(tmp_path / "bag", drive(ros, count=1, infos=infos)), camera=camera))
+    assert found.baseline_m == pytest.approx(BASELINE_M)
+
+
+def test_swapped_cameras_to_the_right_of_the_origin_are_refused(ros, tmp_path):
+    infos = (info_of(ros, baseline_m=0.54), info_of(ros, baseline_m=0.47))
+    with pytest.raises(
+        DatasetError, match=r"means a baseline of -0\.07 m .*if the cameras are swapped, give --topic"
+    ) as caught:
+        opened(ros.write(tmp_path / "bag", drive(ros, count=1, infos=infos)))
+    assert caught.value.field == "right_info"
+
+
+@pytest.mark.parametrize("size", [(WIDTH // 2, HEIGHT), (0, 0)])
+def test_raw_cameras_of_other_sizes_are_refused(ros, tmp_path, size):
+    right = info_of(ros, baseline_m=BASELINE_M)
+    right.width, right.height = size
+    path = ros.write(tmp_path / "bag", drive(ros, count=1, infos=(info_of(ros), right)))
+    with pytest.raises(DatasetError, match=f"left images have 240x64 pixels and the right ones {size[0]}x{size[1]}"):
+        opened(path, rectified=False)
+
+
+@pytest.mark.parametrize(
+    ("model", "D", "told"),
+    [
+        ("plumb_bob", (0.1, 0.0, 0.0), r"'plumb_bob' has 3 coefficients \(valid: 4, 5, 8, 12, 14\)"),
+        ("equidistant", (0.1, 0.0), r"'equidistant' has 2 coefficients \(valid: 4 or more\)"),
+    ],
+)
+def test_a_lens_with_another_number_of_coefficients_is_refused(ros, tmp_path, model, D, told):
+    infos = (info_of(ros), info_of(ros, D=D, model=model, baseline_m=BASELINE_M))
+    path = ros.write(tmp_path / "bag", drive(ros, count=1, infos=infos))
+    with pytest.raises(DatasetError, match=f"right camera: distortion_model {told}"):
+        opened(path, rectified=False)
+
+
 def test_rectified_cameras_with_other_projections_are_refused(ros, tmp_path):
     infos = (info_of(ros), info_of(ros, cx=(WIDTH - 1) / 2 + 4, baseline_m=BASELINE_M))
     with pytest.raises(DatasetError, match=r"another cx in their P: 119.5 and 123.5 px"):
@@ -220,3 +268,15 @@ def test_rows_are_measured_on_pairs_that_are_spread_over_the_drive(ros, tmp_path
         stamps = [pair.stamp_s for pair in spread_pairs(bag, LEFT, RIGHT)]
     assert len(stamps) == PAIRS
     assert np.diff(stamps) == pytest.approx(4.7 / PAIRS, abs=0.1)
+
+
+def test_a_bag_without_pairs_is_searched_once(ros, tmp_path, monkeypatch):
+    begins = []
+    path = ros.write(tmp_path / "bag", drive(ros, late_s=0.02))
+    with opened_bag(path) as bag:
+        messages = type(bag).messages
+        monkeypatch.setattr(
+            type(bag), "messages", lambda self, topics, **told: begins.append(told) or messages(self, topics, **told)
+        )
+        assert list(spread_pairs(bag, LEFT, RIGHT)) == []
+    assert len(begins) == 1
