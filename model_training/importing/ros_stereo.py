@@ -133,7 +133,7 @@ def offset_m(message: Any) -> float:
 
 
 def require_same_projection(left: Any, right: Any, *, source: str) -> None:
-    """Refuse rectified cameras whose projections differ.
+    """Refuse rectified cameras whose projections differ. A right camera that is not calibrated (all zeros) says nothing.
 
     Args:
         left: CameraInfo of the left camera.
@@ -144,6 +144,8 @@ def require_same_projection(left: Any, right: Any, *, source: str) -> None:
         DatasetError: fx, cx or cy differs.
     """
     of_left, of_right = (_matrix(each, "p", (3, 4)) for each in (left, right))
+    if not of_right.any():
+        return
     for name, at in (("fx", (0, 0)), ("cx", (0, 2)), ("cy", (1, 2))):
         if not abs(of_left[at] - of_right[at]) <= _MOST_DIFFERENCE_PX:  # true for NaN too
             raise DatasetError(

@@ -26,7 +26,7 @@ from service.client.prepare import (
     StreamFrame,
     StreamOptions,
 )
-from service.client.rest import geojson
+from service.client.rest import authorization, geojson
 from service.client.retry import Attempts, RetryPolicy
 from service.client.stream_answer import StreamAnswer
 from service.client.stream_call import StreamCall
@@ -105,7 +105,7 @@ class GrpcClient:
                 f"timeout_s: {timeout_s} is not a valid timeout; pass a positive number of seconds", field="timeout_s"
             )
         self._address, self._timeout_s = address, timeout_s
-        self._metadata = () if api_key is None else (("authorization", f"Bearer {api_key}"),)
+        self._metadata = () if api_key is None else (("authorization", authorization(api_key)),)
         self._packing = Packing(quality, depth_codec)
         self._policy = retry or RetryPolicy()
         self._sleep, self._clock, self._draw = sleep, clock, draw

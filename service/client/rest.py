@@ -166,7 +166,8 @@ def settings_for(url: str, *, api_key: str | None, timeout_s: float, tls: Client
         tls: TLS settings. They apply only to ``https://``.
 
     Raises:
-        RequestError: the address is invalid, the timeout is not positive, or TLS arguments are given for ``http://``.
+        RequestError: the address is invalid, the timeout is not positive, no service has such an API key, or TLS arguments are given for
+            ``http://``.
         KeysError: a TLS file cannot be used.
     """
     if not (timeout_s > 0 and math.isfinite(timeout_s)):
@@ -186,10 +187,25 @@ def settings_for(url: str, *, api_key: str | None, timeout_s: float, tls: Client
         "timeout": timeout_s,
         # Without TLS httpx would still load all public authorities. An empty context saves that time.
         "verify": tls.context() if address.scheme == "https" else ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT),
-        "headers": {} if api_key is None else {"Authorization": f"Bearer {api_key}"},
+        "headers": {} if api_key is None else {"Authorization": authorization(api_key)},
         # A proxy of the environment is for other machines. It cannot reach the loopback of this machine.
         "trust_env": address.host not in _LOOPBACK,
     }
+
+
+def authorization(api_key: str) -> str:
+    """Return the value of the header that has the API key.
+
+    Args:
+        api_key: API key.
+
+    Raises:
+        RequestError: it is empty, or has a character that no key has, such as the line break at the end of a file.
+    """
+    if not api_key or not api_key.isascii() or not api_key.isprintable() or " " in api_key:
+        what = "is empty" if not api_key else "has a space, a line break or another character that no key has"
+        raise RequestError(f"api_key: it {what}; pass the key that `streetfix keys` showed", field="api_key")
+    return f"Bearer {api_key}"
 
 
 def answer_of(call: Call[A], response: httpx.Response) -> A:

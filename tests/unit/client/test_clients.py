@@ -13,7 +13,18 @@ import httpx
 import numpy as np
 import pytest
 
-from service.client import AsyncClient, Client, Frame, Options, PinholeCamera, Prior, PriorPosition, PriorWgs84, rest
+from service.client import (
+    AsyncClient,
+    Client,
+    Frame,
+    GrpcClient,
+    Options,
+    PinholeCamera,
+    Prior,
+    PriorPosition,
+    PriorWgs84,
+    rest,
+)
 from service.client.retry import RetryPolicy
 from service.client.tls import ClientTls
 from service.contract.schema import Camera as SchemaCamera
@@ -582,3 +593,15 @@ def test_a_height_that_is_none_is_refused_before_it_is_sent(ask: Asking, about: 
     with pytest.raises(RequestError) as caught:
         ask(lambda _: httpx.Response(500), "localize", RGB, DEPTH, CAMERA, **about)
     assert caught.value.field == field
+
+
+@pytest.mark.parametrize("make", [Client, AsyncClient, GrpcClient])
+@pytest.mark.parametrize(
+    ("key", "why"),
+    [("", "is empty"), ("abc\n", "a line break"), ("a b", "has a space"), ("schl\u00fcssel", "another character")],
+)
+def test_a_key_that_no_service_has_is_refused_at_once(make: Any, key: str, why: str) -> None:
+    address = "127.0.0.1:1" if make is GrpcClient else "http://127.0.0.1:1"
+    with pytest.raises(RequestError, match=rf"api_key: it .*{why}.*`streetfix keys`") as caught:
+        make(address, api_key=key)
+    assert caught.value.field == "api_key"

@@ -227,6 +227,16 @@ def test_a_lens_with_another_number_of_coefficients_is_refused(ros, tmp_path, mo
         opened(path, rectified=False)
 
 
+def test_a_given_baseline_needs_no_calibration_of_the_right_camera(ros, tmp_path):
+    right = info_of(ros, baseline_m=BASELINE_M)
+    right.p = np.zeros(12)
+    (found,) = pictures(
+        opened(ros.write(tmp_path / "bag", drive(ros, count=1, infos=(info_of(ros), right))), baseline_m=BASELINE_M)
+    )
+    assert found.baseline_m == BASELINE_M
+    assert np.median(found.depth[INNER]) == pytest.approx(DEPTH_M, abs=0.02)
+
+
 def test_rectified_cameras_with_other_projections_are_refused(ros, tmp_path):
     infos = (info_of(ros), info_of(ros, cx=(WIDTH - 1) / 2 + 4, baseline_m=BASELINE_M))
     with pytest.raises(DatasetError, match=r"another cx in their P: 119.5 and 123.5 px"):
