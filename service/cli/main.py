@@ -190,5 +190,5 @@ def _extra_missing(command: str, extra: str | None, error: ModuleNotFoundError) 
         extra = needed
     remedy = how_to_install(extra) if extra else "install the packages that it needs"
     if package_of(error) in _NOT_EVERYWHERE:
-        remedy = f"it is available only {_NOT_EVERYWHERE[package_of(error)]} ({remedy})"
+        remedy = f"{remedy} (the package is available only {_NOT_EVERYWHERE[package_of(error)]})"
     return ExtraMissingError(f"the command {command!r} needs the package {error.name!r}: {remedy}", field=command)

@@ -233,8 +233,9 @@ class Settings(BaseSettings):
         guarded = self.api_keys is not None or self.tls_client_ca is not None
         if not (guarded or self.insecure_public or is_loopback(self.host)):
             raise ValueError(
-                f"host {self.host} can be reached from other machines without a key; set api_keys (streetfix keys) or "
-                "tls_client_ca, or insecure_public if a proxy or firewall protects the service"
+                f"host {self.host} can be reached from other machines without a key; set STREETFIX_API_KEYS to the "
+                "file of `streetfix keys`, or STREETFIX_TLS_CLIENT_CA. If a proxy or firewall protects the service, set "
+                "STREETFIX_INSECURE_PUBLIC=true"
             )
         return self
 
@@ -347,7 +348,7 @@ def load_settings(config: Path | None = None, **flags: object) -> Settings:
         elif where:
             what = f"setting {where}: {first['msg']} (it is {first['input']!r})"
         else:
-            what = f"settings: {first['msg']}"
+            what = f"settings: {first['msg'].removeprefix('Value error, ')}"
         raise RequestError(what, field=where) from error
     except PermissionError as error:
         raise RequestError(

@@ -66,3 +66,26 @@ def test_every_package_of_the_server_is_known() -> None:
     modules = {frozenset(of_distribution[name]) for name in named}
     known = {package for package, extra in EXTRA_OF_PACKAGE.items() if extra == "server"}
     assert [each for each in modules if not each & known] == []
+
+
+@pytest.mark.parametrize("where", ["imports", "command"])
+def test_ctrl_c_ends_it_without_a_traceback(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], where: str
+) -> None:
+    class Interrupted(MetaPathFinder):
+        def find_spec(self, name: str, *_: object) -> None:
+            if name == "service.cli.main":
+                raise KeyboardInterrupt
+
+    def stop() -> None:
+        raise KeyboardInterrupt
+
+    if where == "imports":
+        monkeypatch.delitem(sys.modules, "service.cli.main", raising=False)
+        monkeypatch.setattr(sys, "meta_path", [Interrupted(), *sys.meta_path])
+    else:
+        monkeypatch.setattr("service.cli.main.main", stop)
+    with pytest.raises(SystemExit) as end:
+        start.main()
+    assert end.value.code == 130
+    assert capsys.readouterr() == ("", "")

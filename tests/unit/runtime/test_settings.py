@@ -14,6 +14,15 @@ def test_the_service_binds_to_loopback_by_default() -> None:
     assert Settings().host == "127.0.0.1"
 
 
+def test_beyond_loopback_a_service_without_keys_is_refused_with_the_remedies() -> None:
+    with pytest.raises(RequestError) as caught:
+        load_settings(host="0.0.0.0")  # noqa: S104
+    assert caught.value.message.startswith(
+        "settings: host 0.0.0.0 can be reached from other machines without a key; set STREETFIX_API_KEYS"
+    )
+    assert all(f"STREETFIX_{name}" in caught.value.message for name in ("TLS_CLIENT_CA", "INSECURE_PUBLIC=true"))
+
+
 def test_the_environment_goes_above_defaults_and_flags_above_both(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("STREETFIX_PORT", "9000")
     monkeypatch.setenv("STREETFIX_QUEUE", "3")
