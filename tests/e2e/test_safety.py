@@ -115,8 +115,8 @@ def refused(bundle: Path, **settings: object) -> str:
 def test_a_public_address_without_keys_is_refused(bundle_path: Path, host: str) -> None:
     told = refused(bundle_path, host=host)
     assert host in told
-    assert "api_keys" in told
-    assert "insecure_public" in told
+    assert "STREETFIX_API_KEYS" in told
+    assert "STREETFIX_INSECURE_PUBLIC=true" in told
 
 
 def test_the_operator_may_insist(start: Start) -> None:

@@ -17,6 +17,8 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
+
 from benchmarks.serving.agreement import Named, Switch, disagreements
 from service.cli import workers
 from service.errors import BundleError, StreetfixError
@@ -42,7 +44,7 @@ def opened(path: Path, **_: object) -> Any:
     time.sleep(_CHANCE.uniform(0, 0.02))
     if (path / "damaged").exists() or not path.exists():
         raise BundleError(f"{path}: damaged")
-    return SimpleNamespace(name="m", path=path, manifest=manifest_of(path))
+    return SimpleNamespace(name="m", path=path, manifest=manifest_of(path), places_xy=np.zeros((2, 1)))
 
 
 patched: Any = map_watcher
