@@ -14,6 +14,8 @@ import uvicorn
 from service.grpc.generated.streetfix.v1.localization_pb2_grpc import LocalizationServiceStub
 from service.grpc.server import GrpcServer
 from service.http.app import create_app
+from service.maps.content import BundleContent
+from service.maps.writer import write_bundle
 from service.runtime.engine import Engine
 from service.runtime.settings import Settings
 
@@ -45,3 +47,19 @@ def both_faces(bundle: Path, **settings: Any) -> Iterator[Faces]:
 def serving() -> Callable[..., AbstractContextManager[Faces]]:
     """Return a context manager that serves a map by REST and gRPC on one engine, with given settings."""
     return both_faces
+
+
+@pytest.fixture(scope="session")
+def serving_with_confidence(
+    content_of: Callable[..., BundleContent],
+    constant_calibration: Callable[..., dict[str, Any]],
+    tmp_path_factory: pytest.TempPathFactory,
+) -> Callable[..., AbstractContextManager[Faces]]:
+    """Return ``serving`` of a map whose calibration gives the same confidence to every answer."""
+
+    def served(**confidence: float) -> AbstractContextManager[Faces]:
+        folder: Path = tmp_path_factory.mktemp("confidence") / "tiny"
+        write_bundle(folder, content_of(calibration=constant_calibration(**confidence)))
+        return both_faces(folder)
+
+    return served

@@ -1,5 +1,6 @@
 """With several maps and no name, the nearest map to the prior on the Earth answers, through every face."""
 
+import base64
 import json
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -16,6 +17,8 @@ from service.maps.writer import write_bundle
 Parts = Callable[..., dict[str, bytes]]
 CAMERA: dict[str, Any] = {"width": 64, "height": 48, "fx": 32, "fy": 32, "cx": 31.5, "cy": 23.5}
 DEPTH: dict[str, Any] = {"scale_m": 1}
+#: Requests as the clients of the OSCP protocol write them.
+GOLDEN = Path(__file__).parents[1] / "golden" / "oscp"
 #: Origins of the maps, degrees.
 ORIGINS = {"north": (50.1, 8.0), "south": (50.0, 8.0)}
 #: It neither moved nor turned.
@@ -88,6 +91,26 @@ def test_the_first_frame_of_a_stream_chooses_the_map_of_all_frames(faces: Any, p
     ]
     answers = list(faces[1].LocalizeStream(iter([pb.LocalizeStreamRequest(frame=each) for each in frames])))
     assert [each.outcome.answer.map.name for each in answers] == [name] * 3
+
+
+def test_the_oscp_protocol_names_no_map(faces: Any, parts_of: Parts) -> None:
+    """Its reading of a satellite receiver chooses the map. An answer that is not LOCALIZED is the problem `no-pose`, without a map."""
+    sent = json.loads((GOLDEN / "python.json").read_text())
+    body, parts = sent["body"], parts_of()
+    for reading in body["sensorReadings"]["cameraReadings"]:
+        content = parts["depth"] if reading["imageFormat"] == "DEPTH" else parts["rgb"]
+        reading["imageBytes"] = base64.b64encode(content).decode()
+    body["priorPoses"] = []
+    for name, (latitude_deg, longitude_deg) in ORIGINS.items():
+        body["sensorReadings"]["geolocationReadings"] = [
+            {"latitude": latitude_deg, "longitude": longitude_deg, "accuracy": 50.0}
+        ]
+        found = faces[0].post("/geopose", content=json.dumps(body), headers=sent["headers"])
+        assert found.status_code == 200, (name, found.text)
+        assert found.json()["geopose"]["position"]["lat"] == pytest.approx(latitude_deg, abs=0.001)
+    body["sensorReadings"]["geolocationReadings"] = None
+    refused = faces[0].post("/geopose", content=json.dumps(body), headers=sent["headers"])
+    assert (refused.status_code, refused.json()["field"]) == (404, "map")
 
 
 def test_without_a_position_on_the_earth_a_name_is_needed(faces: Any, parts_of: Parts) -> None:

@@ -30,7 +30,6 @@ from service.grpc.generated.streetfix.v1 import localization_pb2 as pb
 from service.grpc.generated.streetfix.v1.localization_pb2_grpc import LocalizationServiceStub
 from service.grpc.server import GrpcServer
 from service.localization.track_bytes import MOST_BYTES
-from service.maps.content import BundleContent
 from service.maps.writer import write_bundle
 from service.runtime.engine import Engine
 from service.runtime.settings import Settings
@@ -48,16 +47,9 @@ RIGHT, KNOWN, THRESHOLD = 0.8, 0.95, 0.9
 
 
 @pytest.fixture(scope="module")
-def faces(
-    content_of: Callable[..., BundleContent],
-    constant_calibration: Callable[..., dict[str, Any]],
-    tmp_path_factory: pytest.TempPathFactory,
-    serving: Any,
-) -> Iterator[tuple[httpx.Client, LocalizationServiceStub, str]]:
+def faces(serving_with_confidence: Any) -> Iterator[tuple[httpx.Client, LocalizationServiceStub, str]]:
     """REST, gRPC, and the address of gRPC, on one engine."""
-    folder: Path = tmp_path_factory.mktemp("tracks") / "tiny"
-    write_bundle(folder, content_of(calibration=constant_calibration(right=RIGHT, known=KNOWN, threshold=THRESHOLD)))
-    with serving(folder) as both:
+    with serving_with_confidence(right=RIGHT, known=KNOWN, threshold=THRESHOLD) as both:
         yield both
 
 

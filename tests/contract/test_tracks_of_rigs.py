@@ -3,7 +3,6 @@
 import asyncio
 import json
 from collections.abc import Callable, Iterator
-from pathlib import Path
 from typing import Any
 
 import grpc
@@ -13,8 +12,6 @@ import pytest
 
 from service.client import AsyncClient, Client, Frame, GrpcClient, RequestError, Track
 from service.grpc.generated.streetfix.v1 import localization_pb2 as pb
-from service.maps.content import BundleContent
-from service.maps.writer import write_bundle
 
 Parts = Callable[..., dict[str, bytes]]
 CAMERA: dict[str, Any] = {"width": 64, "height": 48, "fx": 32, "fy": 32, "cx": 31.5, "cy": 23.5}
@@ -28,15 +25,9 @@ RIGHT, KNOWN, THRESHOLD = 0.8, 0.95, 0.9
 
 
 @pytest.fixture(scope="module")
-def faces(
-    content_of: Callable[..., BundleContent],
-    constant_calibration: Callable[..., dict[str, Any]],
-    tmp_path_factory: pytest.TempPathFactory,
-    serving: Any,
-) -> Iterator[Any]:
-    folder: Path = tmp_path_factory.mktemp("rigs") / "tiny"
-    write_bundle(folder, content_of(calibration=constant_calibration(right=RIGHT, known=KNOWN, threshold=THRESHOLD)))
-    with serving(folder) as both:
+def faces(serving_with_confidence: Any) -> Iterator[Any]:
+    """REST, gRPC, and the address of gRPC, on one engine."""
+    with serving_with_confidence(right=RIGHT, known=KNOWN, threshold=THRESHOLD) as both:
         yield both
 
 
